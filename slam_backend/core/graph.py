@@ -1,0 +1,164 @@
+"""The vocabulary between sensors, robust stages and solvers: keyframes, factors, deltas, decisions."""
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Literal, Protocol
+
+import gtsam
+from gtsam.symbol_shorthand import L, X
+
+from .measurement import Array, Measurement, format_stamp
+
+Pose = gtsam.Pose2 | gtsam.Pose3
+Verdict = Literal["accepted", "probation", "refused", "removed", "restored"]
+
+
+@dataclass(frozen=True, slots=True)
+class Keyframe:
+    """A moment that has a pose variable in the graph. `index` counts in order of creation, not of stamp."""
+
+    index: int
+    stamp: int  # ns
+    pose: int  # the key X(index)
+
+
+def keyframe(index: int, stamp: int) -> Keyframe:
+    return Keyframe(index, stamp, int(X(index)))
+
+
+def landmark_key(index: int) -> int:
+    return int(L(index))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Factor:
+    """A GTSAM factor and where it came from; the id is the same in every replay.
+
+    id: `<source>/<stamp>/<n>`, n counting the measurements of that source with that stamp.
+    kind: motion, loop, landmark, pose or gauge; what reports, robust stages and exports sort by.
+    stamps: of the two measured ends, for relative measurements.
+    """
+
+    id: str
+    kind: str
+    factor: gtsam.NonlinearFactor
+    keys: tuple[int, ...]
+    stamps: tuple[int, int] | None = None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Wait:
+    """A measurement that cannot be used before a variable exists; taken up again when it does."""
+
+    measurement: Measurement
+    id: str
+    until: int  # key
+    reason: str
+
+
+@dataclass(frozen=True, slots=True)
+class Decision:
+    """What became of a record or a factor, why, and on what it rested.
+
+    verdict, stage, reason: `stage/reason` is the rule; `detail` a sentence for people.
+    statistic, threshold: the number that was compared, where there was one.
+    """
+
+    stamp: int
+    id: str
+    source: str
+    verdict: Verdict
+    stage: str
+    reason: str
+    detail: str = ""
+    statistic: float | None = None
+    threshold: float | None = None
+    ends: tuple[int, int] | None = None  # the two stamps of a relative measurement
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Delta:
+    """A change to the graph as one value: applied whole or not at all.
+
+    values: first guess of each new variable; for a variable that exists, where to move it.
+    waits, decisions: measurements that could not become factors now, and what was decided about them.
+    """
+
+    add: tuple[Factor, ...] = ()
+    remove: tuple[str, ...] = ()
+    values: Mapping[int, Any] = field(default_factory=dict)
+    waits: tuple[Wait, ...] = ()
+    decisions: tuple[Decision, ...] = ()
+
+    def __add__(self, other: "Delta") -> "Delta":
+        return Delta(
+            self.add + other.add,
+            self.remove + other.remove,
+            {**self.values, **other.values},
+            self.waits + other.waits,
+            self.decisions + other.decisions,
+        )
+
+    def __bool__(self) -> bool:
+        return bool(self.add or self.remove or self.values)
+
+
+class Estimate(Protocol):
+    """What the solver believes now; everything is computed when asked."""
+
+    def pose(self, key: int) -> Pose: ...
+
+    def point(self, key: int) -> Array: ...
+
+    def knows(self, key: int) -> bool: ...
+
+    def values(self) -> gtsam.Values:
+        """Every variable; costs time in proportion to the graph."""
+        ...
+
+    def covariance(self, keys: Sequence[int]) -> Array:
+        """Joint covariance in the order of `keys`, each block at the tangent of its variable. SolverFailure if singular."""
+        ...
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Motion:
+    """`a_T_b` with its covariance at the tangent of b, in the dimension of the space."""
+
+    pose: Pose
+    covariance: Array
+
+    def then(self, other: "Motion") -> "Motion":
+        """`a_T_c` from `a_T_b` and `b_T_c`, as independent measurements."""
+        adjoint = other.pose.inverse().AdjointMap()
+        return Motion(
+            self.pose.compose(other.pose), adjoint @ self.covariance @ adjoint.T + other.covariance
+        )
+
+    def inverse(self) -> "Motion":
+        """`b_T_a`, its covariance moved to the tangent of a."""
+        adjoint = self.pose.AdjointMap()
+        return Motion(self.pose.inverse(), adjoint @ self.covariance @ adjoint.T)
+
+
+def identify(measurement: Measurement, n: int) -> str:
+    return f"{measurement.source}/{format_stamp(measurement.stamp)}/{n}"
+
+
+def total(deltas: Iterable[Delta]) -> Delta:
+    """The sum of many deltas, in time linear in their content."""
+    add: list[Factor] = []
+    remove: list[str] = []
+    values: dict[int, Any] = {}
+    waits: list[Wait] = []
+    decisions: list[Decision] = []
+    for delta in deltas:
+        add += delta.add
+        remove += delta.remove
+        values.update(delta.values)
+        waits += delta.waits
+        decisions += delta.decisions
+    return Delta(tuple(add), tuple(remove), values, tuple(waits), tuple(decisions))
+
+
+Progress = Callable[[int], None]
