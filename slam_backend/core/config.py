@@ -1,0 +1,210 @@
+"""Every setting, once: type, default, range, unit and a sentence. YAML, `--help` and docs are derived from here.
+
+In YAML the sources are named in a list and described at the top level, so that the same file serves the node:
+
+    space: 2d
+    sources: [wheels, trees]
+    wheels: {kind: odometry, topic: /odom}
+    trees: {kind: landmark, topic: /trees, kernel: cauchy}
+"""
+
+import hashlib
+import json
+from collections.abc import Mapping
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from .errors import BadConfig
+
+KernelName = Literal["none", "huber", "cauchy", "tukey", "geman_mcclure", "dcs"]
+
+
+class Section(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+class Keyframes(Section):
+    """When a pose variable is made: as soon as one of these is reached."""
+
+    distance: float = Field(0.5, gt=0, le=1000, description="metres travelled since the last keyframe")
+    angle: float = Field(0.2, gt=0, le=6.3, description="radians turned since the last keyframe")
+    time: float | None = Field(None, gt=0, description="seconds since the last keyframe; none: never for time alone")
+    every: bool = Field(False, description="a keyframe at every message of the driving source")
+
+
+class Settle(Section):
+    lag: float = Field(
+        0.2, ge=0, le=60, description="seconds that a measurement waits for others with older stamps"
+    )
+
+
+class Isam2(Section):
+    """Incremental smoothing (Kaess et al., IJRR 2012)."""
+
+    relinearize_threshold: float = Field(0.1, gt=0, description="change of a variable (m, rad) that relinearizes it")
+    relinearize_skip: int = Field(10, ge=1, description="updates between two looks at that threshold")
+    extra_updates: int = Field(
+        2, ge=0, le=20, description="largest number of further updates after a loop, until nothing relinearizes"
+    )
+    factorization: Literal["auto", "cholesky", "qr"] = Field(
+        "auto", description="auto: Cholesky, and QR for the rest of the run once Cholesky has failed"
+    )
+
+
+class Source(Section):
+    """What every source has."""
+
+    topic: str = Field("", description="topic in the bag or on the network")
+
+
+class Observing(Source):
+    """A source whose measurements become one factor each."""
+
+    kernel: KernelName = Field("none", description="robust kernel around the noise of each factor")
+    kernel_width: float | None = Field(None, gt=0, description="the kernel's parameter, in standard deviations; none: its usual one")
+    keyframe: bool = Field(
+        False, description="make a keyframe at the stamp of each measurement instead of composing motion into it"
+    )
+
+
+class OdometrySource(Source):
+    """Pose of the base in a drifting frame; the first odometry source drives the keyframes."""
+
+    kind: Literal["odometry"] = "odometry"
+    noise: Literal["model", "twist", "pose"] = Field(
+        "model",
+        description="model: the sigmas below; twist: integrated twist covariance; pose: difference of pose covariances",
+    )
+    sigma_translation_per_meter: float = Field(0.05, ge=0, description="m after 1 m of path; grows with its square root")
+    sigma_translation_per_radian: float = Field(0.02, ge=0, description="m after 1 rad turned; grows with its square root")
+    sigma_rotation_per_meter: float = Field(0.01, ge=0, description="rad after 1 m of path; grows with its square root")
+    sigma_rotation_per_radian: float = Field(0.05, ge=0, description="rad after 1 rad turned; grows with its square root")
+    sigma_translation_floor: float = Field(0.002, gt=0, description="m, added to every edge between keyframes")
+    sigma_rotation_floor: float = Field(0.0005, gt=0, description="rad, added to every edge between keyframes")
+    max_speed: float = Field(100.0, gt=0, description="m/s; a faster step is a teleport and is refused")
+
+
+class RelativeSource(Observing):
+    """Pose of one moment in another: loop closures; motion too when there is no odometry source."""
+
+    kind: Literal["relative"] = "relative"
+    sigma_translation: float = Field(0.1, gt=0, description="m, where the message's covariance is zero")
+    sigma_rotation: float = Field(0.05, gt=0, description="rad, where the message's covariance is zero")
+
+
+class LandmarkSource(Observing):
+    """Observations of landmarks with known ids."""
+
+    kind: Literal["landmark"] = "landmark"
+    sigma_position: float = Field(0.1, gt=0, description="m, for positions without noise of their own")
+    sigma_range: float = Field(0.1, gt=0, description="m, for ranges without noise of their own")
+    sigma_bearing: float = Field(0.02, gt=0, description="rad, for bearings without noise of their own")
+
+
+class PoseSource(Observing):
+    """Absolute pose of the base in the map frame (a localizer, /initialpose)."""
+
+    kind: Literal["pose"] = "pose"
+    sigma_translation: float = Field(0.5, gt=0, description="m, where the message's covariance is zero")
+    sigma_rotation: float = Field(0.25, gt=0, description="rad, where the message's covariance is zero")
+
+
+AnySource = Annotated[
+    OdometrySource | RelativeSource | LandmarkSource | PoseSource, Field(discriminator="kind")
+]
+
+
+class Config(Section):
+    """The whole configuration; `Config()` works for one odometry topic and standard loop closures."""
+
+    space: Literal["2d", "3d"] = Field("3d", description="2d: x, y and yaw are estimated; 3d: all six")
+    base_frame: str = Field("", description="name of the robot's frame; empty: the child frame of the odometry")
+    keyframes: Keyframes = Keyframes()
+    settle: Settle = Settle()
+    isam2: Isam2 = Isam2()
+    extrinsics: Mapping[str, tuple[float, float, float, float, float, float]] = Field(
+        default_factory=dict, description="frame: x, y, z (m), roll, pitch, yaw (rad) of that sensor in the base"
+    )
+    sources: Mapping[str, AnySource] = Field(
+        default_factory=dict, description="the inputs by name; empty: found by the types of the topics"
+    )
+
+    @model_validator(mode="after")
+    def _something_drives(self) -> "Config":
+        for name in self.sources:
+            if not name or "/" in name or "@" in name:
+                raise ValueError(f"source name '{name}' must not be empty or contain '/' or '@'")
+        if self.sources and self.driver is None:
+            raise ValueError("no source drives the keyframes: add one of kind odometry or relative")
+        return self
+
+    @property
+    def driver(self) -> str | None:
+        """The source that drives the keyframes: the first odometry, else the first relative."""
+        for kind in ("odometry", "relative"):
+            for name, source in self.sources.items():
+                if source.kind == kind:
+                    return name
+        return None
+
+
+def config_from(data: Mapping[str, Any], origin: str = "config") -> Config:
+    """Build a Config from what a YAML file holds; BadConfig names `origin`, the setting and what to do.
+
+    A file for the node (`<node>: {ros__parameters: {...}}`) is taken as well.
+    """
+    if len(data) == 1 and isinstance(inner := next(iter(data.values())), Mapping) and "ros__parameters" in inner:
+        data = inner["ros__parameters"]
+    flat = dict(data)
+    listed = flat.get("sources", [])
+    if isinstance(listed, (list, tuple)):
+        missing = [name for name in listed if name not in flat]
+        if missing:
+            raise BadConfig(f"{origin}: source '{missing[0]}' is listed in 'sources' but not described: add '{missing[0]}: {{kind: ...}}'")
+        flat["sources"] = {name: flat.pop(name) for name in dict.fromkeys(listed)}
+    try:
+        return Config.model_validate(flat)
+    except ValidationError as error:
+        raise BadConfig(f"{origin}: {_first_line(error)}") from None
+
+
+def config_to(config: Config) -> dict[str, Any]:
+    """The effective configuration as YAML holds it; `config_from` gives the same Config back."""
+    data = config.model_dump(mode="json")
+    sources = data.pop("sources")
+    return {**data, "sources": list(sources), **sources}
+
+
+def config_hash(config: Config) -> str:
+    return hashlib.sha256(json.dumps(config_to(config), sort_keys=True).encode()).hexdigest()
+
+
+def _first_line(error: ValidationError) -> str:
+    first = error.errors(include_url=False)[0]
+    where = ".".join(str(part) for part in first["loc"] if part != "sources") or "the file"
+    what = first["msg"].removeprefix("Value error, ")
+    if first["type"] == "extra_forbidden":
+        what = f"there is no such setting{_suggest(first['loc'])}"
+    more = error.error_count() - 1
+    value = first.get("input")
+    said = f" (it says {value!r})" if isinstance(value, (str, int, float, bool)) and first["type"] != "extra_forbidden" else ""
+    return f"{where}: {what}{said}" + (f"; and {more} more" if more else "")
+
+
+def _suggest(location: tuple[int | str, ...]) -> str:
+    """`; did you mean '...'?` for a misspelt key, from the settings of the section it stands in."""
+    from difflib import get_close_matches
+
+    *path, key = [str(part) for part in location]
+    known: set[str] = set(Config.model_fields)
+    if path[:1] == ["sources"]:
+        kinds = {"odometry": OdometrySource, "relative": RelativeSource, "landmark": LandmarkSource, "pose": PoseSource}
+        known = set(kinds[path[-1]].model_fields) if path[-1] in kinds else set(kinds)
+    elif path:
+        section = Config.model_fields[path[0]].annotation
+        known = set(getattr(section, "model_fields", {}))
+    close = get_close_matches(key, known, n=1)
+    if close:
+        return f"; did you mean '{close[0]}'?"
+    return f"; known: {', '.join(sorted(known))}" if known else ""

@@ -1,0 +1,23 @@
+"""One file per sensor; this table is the list of them."""
+
+from collections.abc import Callable, Iterable, Mapping
+from typing import NamedTuple
+
+from ..measurement import Measurement, Message
+from . import landmark, odometry, pose, relative
+
+Decoder = Callable[[Message, str], Measurement | Iterable[Measurement]]
+
+
+class Sensor(NamedTuple):
+    """decoders: ROS type name -> (message, source) -> measurements."""
+
+    decoders: Mapping[str, Decoder]
+
+
+SENSORS: Mapping[str, Sensor] = {
+    "odometry": Sensor(odometry.DECODERS),
+    "relative": Sensor(relative.DECODERS),
+    "landmark": Sensor(landmark.DECODERS),
+    "pose": Sensor(pose.DECODERS),
+}

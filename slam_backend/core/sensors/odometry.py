@@ -1,0 +1,61 @@
+"""Wheel, visual or lidar odometry: the pose of the base in a drifting frame."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..measurement import Array, Measurement, Message, frozen, seven_of, stamp_of
+
+UNKNOWN = frozen(np.zeros(36))  # a covariance of zeros means: use the configured default
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class OdometryPose(Measurement):
+    """`frame_T_child` with what the message says of its noise, all in ROS order."""
+
+    frame: str
+    child: str
+    pose: Array  # (7,) x y z qx qy qz qw
+    covariance: Array  # (36,) of the pose
+    twist: Array  # (6,) m/s and rad/s in the child frame
+    twist_covariance: Array  # (36,)
+
+
+STILL = frozen(np.zeros(6))
+
+
+def decode_odometry(message: Message, source: str) -> OdometryPose:
+    """nav_msgs/msg/Odometry."""
+    linear, angular = message.twist.twist.linear, message.twist.twist.angular
+    return OdometryPose(
+        stamp_of(message),
+        source,
+        message.header.frame_id,
+        message.child_frame_id,
+        seven_of(message.pose.pose),
+        frozen(message.pose.covariance),
+        frozen((linear.x, linear.y, linear.z, angular.x, angular.y, angular.z)),
+        frozen(message.twist.covariance),
+    )
+
+
+def decode_pose_with_covariance(message: Message, source: str) -> OdometryPose:
+    """geometry_msgs/msg/PoseWithCovarianceStamped."""
+    return OdometryPose(
+        stamp_of(message), source, message.header.frame_id, "", seven_of(message.pose.pose),
+        frozen(message.pose.covariance), STILL, UNKNOWN,
+    )  # fmt: skip
+
+
+def decode_pose(message: Message, source: str) -> OdometryPose:
+    """geometry_msgs/msg/PoseStamped."""
+    return OdometryPose(
+        stamp_of(message), source, message.header.frame_id, "", seven_of(message.pose), UNKNOWN, STILL, UNKNOWN
+    )
+
+
+DECODERS = {
+    "nav_msgs/msg/Odometry": decode_odometry,
+    "geometry_msgs/msg/PoseWithCovarianceStamped": decode_pose_with_covariance,
+    "geometry_msgs/msg/PoseStamped": decode_pose,
+}
