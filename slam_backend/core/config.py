@@ -29,7 +29,9 @@ class Keyframes(Section):
 
     distance: float = Field(0.5, gt=0, le=1000, description="metres travelled since the last keyframe")
     angle: float = Field(0.2, gt=0, le=6.3, description="radians turned since the last keyframe")
-    time: float | None = Field(None, gt=0, description="seconds since the last keyframe; none: never for time alone")
+    time: float | None = Field(
+        None, gt=0, description="seconds since the last keyframe; none: never for time alone"
+    )
     every: bool = Field(False, description="a keyframe at every message of the driving source")
 
 
@@ -42,10 +44,15 @@ class Settle(Section):
 class Isam2(Section):
     """Incremental smoothing (Kaess et al., IJRR 2012)."""
 
-    relinearize_threshold: float = Field(0.1, gt=0, description="change of a variable (m, rad) that relinearizes it")
+    relinearize_threshold: float = Field(
+        0.1, gt=0, description="change of a variable (m, rad) that relinearizes it"
+    )
     relinearize_skip: int = Field(10, ge=1, description="updates between two looks at that threshold")
     extra_updates: int = Field(
-        2, ge=0, le=20, description="largest number of further updates after a loop, until nothing relinearizes"
+        2,
+        ge=0,
+        le=20,
+        description="largest number of further updates after a loop, until nothing relinearizes",
     )
     factorization: Literal["auto", "cholesky", "qr"] = Field(
         "auto", description="auto: Cholesky, and QR for the rest of the run once Cholesky has failed"
@@ -62,9 +69,12 @@ class Observing(Source):
     """A source whose measurements become one factor each."""
 
     kernel: KernelName = Field("none", description="robust kernel around the noise of each factor")
-    kernel_width: float | None = Field(None, gt=0, description="the kernel's parameter, in standard deviations; none: its usual one")
+    kernel_width: float | None = Field(
+        None, gt=0, description="the kernel's parameter, in standard deviations; none: its usual one"
+    )
     keyframe: bool = Field(
-        False, description="make a keyframe at the stamp of each measurement instead of composing motion into it"
+        False,
+        description="make a keyframe at the stamp of each measurement instead of composing motion into it",
     )
 
 
@@ -76,12 +86,24 @@ class OdometrySource(Source):
         "model",
         description="model: the sigmas below; twist: integrated twist covariance; pose: difference of pose covariances",
     )
-    sigma_translation_per_meter: float = Field(0.05, ge=0, description="m after 1 m of path; grows with its square root")
-    sigma_translation_per_radian: float = Field(0.02, ge=0, description="m after 1 rad turned; grows with its square root")
-    sigma_rotation_per_meter: float = Field(0.01, ge=0, description="rad after 1 m of path; grows with its square root")
-    sigma_rotation_per_radian: float = Field(0.05, ge=0, description="rad after 1 rad turned; grows with its square root")
-    sigma_translation_floor: float = Field(0.002, gt=0, description="m, added to every edge between keyframes")
-    sigma_rotation_floor: float = Field(0.0005, gt=0, description="rad, added to every edge between keyframes")
+    sigma_translation_per_meter: float = Field(
+        0.05, ge=0, description="m after 1 m of path; grows with its square root"
+    )
+    sigma_translation_per_radian: float = Field(
+        0.02, ge=0, description="m after 1 rad turned; grows with its square root"
+    )
+    sigma_rotation_per_meter: float = Field(
+        0.01, ge=0, description="rad after 1 m of path; grows with its square root"
+    )
+    sigma_rotation_per_radian: float = Field(
+        0.05, ge=0, description="rad after 1 rad turned; grows with its square root"
+    )
+    sigma_translation_floor: float = Field(
+        0.002, gt=0, description="m, added to every edge between keyframes"
+    )
+    sigma_rotation_floor: float = Field(
+        0.0005, gt=0, description="rad, added to every edge between keyframes"
+    )
     max_speed: float = Field(100.0, gt=0, description="m/s; a faster step is a teleport and is refused")
 
 
@@ -119,12 +141,15 @@ class Config(Section):
     """The whole configuration; `Config()` works for one odometry topic and standard loop closures."""
 
     space: Literal["2d", "3d"] = Field("3d", description="2d: x, y and yaw are estimated; 3d: all six")
-    base_frame: str = Field("", description="name of the robot's frame; empty: the child frame of the odometry")
+    base_frame: str = Field(
+        "", description="name of the robot's frame; empty: the child frame of the odometry"
+    )
     keyframes: Keyframes = Keyframes()
     settle: Settle = Settle()
     isam2: Isam2 = Isam2()
     extrinsics: Mapping[str, tuple[float, float, float, float, float, float]] = Field(
-        default_factory=dict, description="frame: x, y, z (m), roll, pitch, yaw (rad) of that sensor in the base"
+        default_factory=dict,
+        description="frame: x, y, z (m), roll, pitch, yaw (rad) of that sensor in the base",
     )
     sources: Mapping[str, AnySource] = Field(
         default_factory=dict, description="the inputs by name; empty: found by the types of the topics"
@@ -154,14 +179,20 @@ def config_from(data: Mapping[str, Any], origin: str = "config") -> Config:
 
     A file for the node (`<node>: {ros__parameters: {...}}`) is taken as well.
     """
-    if len(data) == 1 and isinstance(inner := next(iter(data.values())), Mapping) and "ros__parameters" in inner:
+    if (
+        len(data) == 1
+        and isinstance(inner := next(iter(data.values())), Mapping)
+        and "ros__parameters" in inner
+    ):
         data = inner["ros__parameters"]
     flat = dict(data)
     listed = flat.get("sources", [])
     if isinstance(listed, (list, tuple)):
         missing = [name for name in listed if name not in flat]
         if missing:
-            raise BadConfig(f"{origin}: source '{missing[0]}' is listed in 'sources' but not described: add '{missing[0]}: {{kind: ...}}'")
+            raise BadConfig(
+                f"{origin}: source '{missing[0]}' is listed in 'sources' but not described: add '{missing[0]}: {{kind: ...}}'"
+            )
         flat["sources"] = {name: flat.pop(name) for name in dict.fromkeys(listed)}
     try:
         return Config.model_validate(flat)
@@ -188,7 +219,11 @@ def _first_line(error: ValidationError) -> str:
         what = f"there is no such setting{_suggest(first['loc'])}"
     more = error.error_count() - 1
     value = first.get("input")
-    said = f" (it says {value!r})" if isinstance(value, (str, int, float, bool)) and first["type"] != "extra_forbidden" else ""
+    said = (
+        f" (it says {value!r})"
+        if isinstance(value, (str, int, float, bool)) and first["type"] != "extra_forbidden"
+        else ""
+    )
     return f"{where}: {what}{said}" + (f"; and {more} more" if more else "")
 
 
@@ -199,7 +234,12 @@ def _suggest(location: tuple[int | str, ...]) -> str:
     *path, key = [str(part) for part in location]
     known: set[str] = set(Config.model_fields)
     if path[:1] == ["sources"]:
-        kinds = {"odometry": OdometrySource, "relative": RelativeSource, "landmark": LandmarkSource, "pose": PoseSource}
+        kinds = {
+            "odometry": OdometrySource,
+            "relative": RelativeSource,
+            "landmark": LandmarkSource,
+            "pose": PoseSource,
+        }
         known = set(kinds[path[-1]].model_fields) if path[-1] in kinds else set(kinds)
     elif path:
         section = Config.model_fields[path[0]].annotation

@@ -131,9 +131,7 @@ class Motion:
     def then(self, other: "Motion") -> "Motion":
         """`a_T_c` from `a_T_b` and `b_T_c`, as independent measurements."""
         adjoint = other.pose.inverse().AdjointMap()
-        return Motion(
-            self.pose.compose(other.pose), adjoint @ self.covariance @ adjoint.T + other.covariance
-        )
+        return Motion(self.pose.compose(other.pose), adjoint @ self.covariance @ adjoint.T + other.covariance)
 
     def inverse(self) -> "Motion":
         """`b_T_a`, its covariance moved to the tangent of a."""

@@ -1,6 +1,5 @@
 """sensor_msgs/PointCloud2 as named columns: how tables of observations travel without custom messages."""
 
-
 import numpy as np
 
 from ..errors import BadMessage
@@ -14,7 +13,9 @@ def columns(message: Message) -> dict[str, np.ndarray]:  # type: ignore[type-arg
     points, step = int(message.width) * int(message.height), int(message.point_step)
     data = np.frombuffer(memoryview(message.data), dtype=np.uint8)
     if points * step > data.size:
-        raise BadMessage(f"point cloud holds {data.size} bytes where {points} points of {step} bytes are announced")
+        raise BadMessage(
+            f"point cloud holds {data.size} bytes where {points} points of {step} bytes are announced"
+        )
     order = ">" if message.is_bigendian else "<"
     names, formats, offsets = [], [], []
     for field in message.fields:

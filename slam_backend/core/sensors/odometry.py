@@ -50,7 +50,14 @@ def decode_pose_with_covariance(message: Message, source: str) -> OdometryPose:
 def decode_pose(message: Message, source: str) -> OdometryPose:
     """geometry_msgs/msg/PoseStamped."""
     return OdometryPose(
-        stamp_of(message), source, message.header.frame_id, "", seven_of(message.pose), UNKNOWN, STILL, UNKNOWN
+        stamp_of(message),
+        source,
+        message.header.frame_id,
+        "",
+        seven_of(message.pose),
+        UNKNOWN,
+        STILL,
+        UNKNOWN,
     )
 
 
