@@ -55,7 +55,7 @@ class Isam2(Section):
         description="largest number of further updates after a loop, until nothing relinearizes",
     )
     factorization: Literal["auto", "cholesky", "qr"] = Field(
-        "auto", description="auto: Cholesky, and QR for the rest of the run once Cholesky has failed"
+        default="auto", description="auto: Cholesky, and QR for the rest of the run once Cholesky has failed"
     )
 
 
@@ -234,7 +234,7 @@ def _suggest(location: tuple[int | str, ...]) -> str:
     *path, key = [str(part) for part in location]
     known: set[str] = set(Config.model_fields)
     if path[:1] == ["sources"]:
-        kinds = {
+        kinds: dict[str, type[Section]] = {
             "odometry": OdometrySource,
             "relative": RelativeSource,
             "landmark": LandmarkSource,

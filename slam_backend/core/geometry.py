@@ -42,7 +42,7 @@ def quaternion_of(rotations: ArrayLike) -> Array:
     q = table[np.arange(len(m)), squares.argmax(axis=1)]
     q /= np.linalg.norm(q, axis=1, keepdims=True)
     q[q[:, 3] < 0] *= -1
-    return q.reshape(*shape, 4)
+    return np.asarray(q.reshape(*shape, 4))
 
 
 def matrix_of(sevens: ArrayLike) -> Array:

@@ -1,6 +1,6 @@
 """The vocabulary between sensors, robust stages and solvers: keyframes, factors, deltas, decisions."""
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal, Protocol
 
@@ -9,7 +9,7 @@ from gtsam.symbol_shorthand import L, X
 
 from .measurement import Array, Measurement, format_stamp
 
-Pose = gtsam.Pose2 | gtsam.Pose3
+Pose = Any  # gtsam.Pose2 or gtsam.Pose3: the same methods, no common base
 Verdict = Literal["accepted", "probation", "refused", "removed", "restored"]
 
 
@@ -157,6 +157,3 @@ def total(deltas: Iterable[Delta]) -> Delta:
         waits += delta.waits
         decisions += delta.decisions
     return Delta(tuple(add), tuple(remove), values, tuple(waits), tuple(decisions))
-
-
-Progress = Callable[[int], None]

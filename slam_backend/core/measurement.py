@@ -10,6 +10,7 @@ Conventions, everywhere in this package:
 Arrays in records are read-only. Records neither compare nor hash (`eq=False`): their arrays could not.
 """
 
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Any
 
@@ -76,3 +77,6 @@ def parse_frame(text: str) -> tuple[str, int | None]:
     """Split `<frame>@<sec>.<nsec>` into the frame and its stamp (None without `@`)."""
     frame, at, stamp = text.partition("@")
     return frame.lstrip("/"), parse_stamp(stamp) if at else None
+
+
+Decoder = Callable[[Message, str], Measurement | Iterable[Measurement]]  # (message, source)

@@ -1,12 +1,10 @@
 """One file per sensor; this table is the list of them."""
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Mapping
 from typing import NamedTuple
 
-from ..measurement import Measurement, Message
+from ..measurement import Decoder
 from . import landmark, odometry, pose, relative
-
-Decoder = Callable[[Message, str], Measurement | Iterable[Measurement]]
 
 
 class Sensor(NamedTuple):

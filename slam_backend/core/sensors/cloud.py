@@ -1,6 +1,9 @@
 """sensor_msgs/PointCloud2 as named columns: how tables of observations travel without custom messages."""
 
+from typing import Any
+
 import numpy as np
+from numpy.typing import NDArray
 
 from ..errors import BadMessage
 from ..measurement import Message
@@ -8,7 +11,7 @@ from ..measurement import Message
 _TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
 
 
-def columns(message: Message) -> dict[str, np.ndarray]:  # type: ignore[type-arg]  # one dtype per column
+def columns(message: Message) -> dict[str, NDArray[Any]]:
     """Field name -> (N,) array, or (N, count) where the field's count exceeds 1."""
     points, step = int(message.width) * int(message.height), int(message.point_step)
     data = np.frombuffer(memoryview(message.data), dtype=np.uint8)

@@ -1,13 +1,13 @@
 """Landmarks with known ids, seen from the robot: position, bearing and range, bearing alone."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
 
 from ..errors import BadMessage
-from ..measurement import Array, Measurement, Message, frozen, parse_frame, stamp_of
+from ..measurement import Array, Decoder, Measurement, Message, frozen, parse_frame, stamp_of
 
 Form = Literal["position", "bearing_range", "bearing"]
 
@@ -32,7 +32,8 @@ class LandmarkObservation(Measurement):
 
 def decode_points(message: Message, source: str) -> Iterable[LandmarkObservation]:
     """sensor_msgs/msg/PointCloud2: one observation per point; the fields `id` and `x y [z]`,
-    `range azimuth [elevation]` or `azimuth [elevation]`; noise by `cov` or `sigma_*`."""
+    `range azimuth [elevation]` or `azimuth [elevation]`; noise by `cov` or `sigma_*`.
+    """
     from .cloud import columns
 
     table = columns(message)
@@ -41,9 +42,12 @@ def decode_points(message: Message, source: str) -> Iterable[LandmarkObservation
     frame, _ = parse_frame(message.header.frame_id)
     stamp, count = stamp_of(message), len(table["id"])
     zero = np.zeros(count)
+    form: Form
+    axes: tuple[str, ...]
     if "x" in table and "y" in table:
-        form: Form = "position"
-        axes, fields = ("x", "y", "z"), [table["x"], table["y"], table.get("z", zero)]
+        form = "position"
+        axes = ("x", "y", "z")
+        fields = [table["x"], table["y"], table.get("z", zero)]
     elif "azimuth" in table:
         fields = [table["azimuth"], table.get("elevation", zero)]
         form, axes = "bearing", ("azimuth", "elevation")
@@ -80,4 +84,4 @@ def _covariance(table: dict[str, Array], n: int, axes: tuple[str, ...]) -> Array
     return np.diag(sigmas**2)
 
 
-DECODERS = {"sensor_msgs/msg/PointCloud2": decode_points}
+DECODERS: Mapping[str, Decoder] = {"sensor_msgs/msg/PointCloud2": decode_points}

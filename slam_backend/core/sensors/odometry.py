@@ -1,10 +1,11 @@
 """Wheel, visual or lidar odometry: the pose of the base in a drifting frame."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 
-from ..measurement import Array, Measurement, Message, frozen, seven_of, stamp_of
+from ..measurement import Array, Decoder, Measurement, Message, frozen, seven_of, stamp_of
 
 UNKNOWN = frozen(np.zeros(36))  # a covariance of zeros means: use the configured default
 
@@ -61,7 +62,7 @@ def decode_pose(message: Message, source: str) -> OdometryPose:
     )
 
 
-DECODERS = {
+DECODERS: Mapping[str, Decoder] = {
     "nav_msgs/msg/Odometry": decode_odometry,
     "geometry_msgs/msg/PoseWithCovarianceStamped": decode_pose_with_covariance,
     "geometry_msgs/msg/PoseStamped": decode_pose,

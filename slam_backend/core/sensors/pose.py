@@ -1,8 +1,9 @@
 """Absolute pose of the base in the map frame: a prior, a localizer, /initialpose."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
-from ..measurement import Array, Measurement, Message, frozen, seven_of, stamp_of
+from ..measurement import Array, Decoder, Measurement, Message, frozen, seven_of, stamp_of
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -21,4 +22,4 @@ def decode(message: Message, source: str) -> AbsolutePose:
     )
 
 
-DECODERS = {"geometry_msgs/msg/PoseWithCovarianceStamped": decode}
+DECODERS: Mapping[str, Decoder] = {"geometry_msgs/msg/PoseWithCovarianceStamped": decode}

@@ -1,12 +1,22 @@
 """The pose of one moment in another: loop closures, and motion where there is no odometry."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
 
 from ..errors import BadMessage
-from ..measurement import SECOND, Array, Measurement, Message, frozen, parse_frame, seven_of, stamp_of
+from ..measurement import (
+    SECOND,
+    Array,
+    Decoder,
+    Measurement,
+    Message,
+    frozen,
+    parse_frame,
+    seven_of,
+    stamp_of,
+)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -79,7 +89,7 @@ def _covariance(table: dict[str, Array], n: int) -> Array:
     return np.diag(sigmas**2).reshape(36)
 
 
-DECODERS = {
+DECODERS: Mapping[str, Decoder] = {
     "nav_msgs/msg/Odometry": decode_odometry,
     "sensor_msgs/msg/PointCloud2": decode_points,
 }
