@@ -1,0 +1,51 @@
+"""What a simulated drive is like: how long, how good the sensors are, what the channel does to messages."""
+
+from dataclasses import dataclass, fields
+
+from ..core.errors import BadConfig
+
+_FRACTIONS = ("loop_rate", "wrong_loop_rate", "dropout", "late", "duplicated")
+
+
+@dataclass(frozen=True, slots=True)
+class Options:
+    """Metres, radians, seconds; fractions lie in 0 to 1.
+
+    Odometry drifts as `core.config.OdometrySource` describes: variances grow with path and with rotation.
+    """
+
+    poses: int = 5000  # odometry messages, and poses of the ground truth
+    period: float = 0.1  # s between two odometry messages
+    sigma_translation_per_meter: float = 0.02  # m after 1 m of path
+    sigma_translation_per_radian: float = 0.01  # m after 1 rad turned
+    sigma_rotation_per_meter: float = 0.002  # rad after 1 m of path
+    sigma_rotation_per_radian: float = 0.01  # rad after 1 rad turned
+    loop_rate: float = 0.1  # fraction of the returns to a place that are noticed
+    loop_range: float = 2.0  # m: how near counts as the same place
+    loop_sigma_translation: float = 0.05  # m
+    loop_sigma_rotation: float = 0.01  # rad
+    loop_delay: float = 0.2  # s from the newer of the two moments to the message
+    wrong_loop_rate: float = 0.0  # fraction of the loops that join two different places
+    landmarks: int | None = None  # how many there are; None: as many as the scenario has
+    landmark_range: float = 8.0  # m: how far they are seen
+    landmark_sigma: float = 0.1  # m, on each axis
+    dropout: float = 0.0  # fraction of the messages that never arrive
+    silence_start: float = 0.0  # s after the start: nothing that is stamped from here ...
+    silence: float = 0.0  # ... for this many seconds arrives
+    late: float = 0.0  # fraction of the messages that arrive late ...
+    late_delay: float = 1.0  # ... by this many seconds
+    duplicated: float = 0.0  # fraction of the messages that arrive twice
+
+    def __post_init__(self) -> None:
+        """BadConfig names the option that makes no sense."""
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if value is not None and not 0 <= value < float("inf"):
+                raise BadConfig(f"{field.name}: must be finite and not negative (it says {value})")
+            if field.name in _FRACTIONS and value > 1:
+                raise BadConfig(f"{field.name}: is a fraction and must not exceed 1 (it says {value})")
+        if self.poses < 2:
+            raise BadConfig(f"poses: a drive needs at least 2 (it says {self.poses})")
+        for name in ("period", "loop_sigma_translation", "loop_sigma_rotation", "landmark_sigma"):
+            if getattr(self, name) == 0:
+                raise BadConfig(f"{name}: must be greater than 0")
