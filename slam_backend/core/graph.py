@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Literal, Protocol
+from typing import Any, Literal, NamedTuple, Protocol
 
 import gtsam
 from gtsam.symbol_shorthand import L, X
@@ -30,6 +30,14 @@ def landmark_key(index: int) -> int:
     return int(L(index))
 
 
+class Offer(NamedTuple):
+    """A measurement on its way into the graph. `motion`: it made a keyframe, so it must enter."""
+
+    id: str
+    measurement: Measurement
+    motion: bool = False
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Factor:
     """A GTSAM factor and where it came from; the id is the same in every replay.
@@ -46,13 +54,15 @@ class Factor:
     stamps: tuple[int, int] | None = None
 
 
+UNTIL_JOINED = 0  # no variable has this key
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Wait:
     """A measurement that cannot be used before a variable exists; taken up again when it does."""
 
-    measurement: Measurement
-    id: str
-    until: int  # key
+    offer: Offer
+    until: int  # key; UNTIL_JOINED: until two components become one
     reason: str
 
 

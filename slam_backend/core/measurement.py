@@ -30,6 +30,11 @@ class Measurement:
     stamp: int
     source: str
 
+    @property
+    def ends(self) -> tuple[int, int] | None:
+        """The two stamps of a relative measurement."""
+        return None
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StaticTransform(Measurement):

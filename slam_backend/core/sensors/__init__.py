@@ -1,21 +1,28 @@
 """One file per sensor; this table is the list of them."""
 
-from collections.abc import Mapping
-from typing import NamedTuple
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple
 
+from ..context import Context
+from ..graph import Delta, Keyframe, Offer
 from ..measurement import Decoder
 from . import landmark, odometry, pose, relative
 
 
 class Sensor(NamedTuple):
-    """decoders: ROS type name -> (message, source) -> measurements."""
+    """decoders: ROS type name -> (message, source) -> measurements.
+
+    factors: (window, a, b, context, config) -> Delta. window: what this source said since keyframe a (None at the
+    first keyframe), and what came late; b: the new keyframe.
+    """
 
     decoders: Mapping[str, Decoder]
+    factors: Callable[[Sequence[Offer], Keyframe | None, Keyframe, Context, Any], Delta]
 
 
 SENSORS: Mapping[str, Sensor] = {
-    "odometry": Sensor(odometry.DECODERS),
-    "relative": Sensor(relative.DECODERS),
-    "landmark": Sensor(landmark.DECODERS),
-    "pose": Sensor(pose.DECODERS),
+    "odometry": Sensor(odometry.DECODERS, odometry.factors),
+    "relative": Sensor(relative.DECODERS, relative.factors),
+    "landmark": Sensor(landmark.DECODERS, landmark.factors),
+    "pose": Sensor(pose.DECODERS, pose.factors),
 }

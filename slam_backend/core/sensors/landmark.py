@@ -1,13 +1,19 @@
 """Landmarks with known ids, seen from the robot: position, bearing and range, bearing alone."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
 
+from ..config import LandmarkSource
+from ..context import Context, defaulted, refuse
 from ..errors import BadMessage
+from ..graph import UNTIL_JOINED, Decision, Delta, Factor, Keyframe, Motion, Offer, Pose, Wait
+from ..keyframes import Placed
 from ..measurement import Array, Decoder, Measurement, Message, frozen, parse_frame, stamp_of
+from ..robust.kernels import noise_of
+from ..space import Space
 
 Form = Literal["position", "bearing_range", "bearing"]
 
@@ -85,3 +91,125 @@ def _covariance(table: dict[str, Array], n: int, axes: tuple[str, ...]) -> Array
 
 
 DECODERS: Mapping[str, Decoder] = {"sensor_msgs/msg/PointCloud2": decode_points}
+
+
+def factors(
+    window: Sequence[Offer],
+    a: Keyframe | None,  # noqa: ARG001
+    b: Keyframe,  # noqa: ARG001
+    context: Context,
+    config: LandmarkSource,
+) -> Delta:
+    """A bearing-range factor per sighting (bearing alone: a bearing factor); a new landmark starts where it is seen.
+
+    There is no native factor for a position in the frame of a pose: a position is turned into bearing and
+    range with its covariance to first order, which is exact enough while sigma is small beside the range.
+    """
+    found: list[Factor] = []
+    points: dict[int, Array] = {}
+    waits: list[Wait] = []
+    decisions: list[Decision] = []
+    for offer in window:
+        made = _sight(offer, context, config, points)
+        if isinstance(made, Factor):
+            found.append(made)
+        elif isinstance(made, Wait):
+            waits.append(made)
+        else:
+            decisions.append(refuse(offer, "landmark", *made))
+    return Delta(tuple(found), values=points, waits=tuple(waits), decisions=tuple(decisions))
+
+
+def _sight(
+    offer: Offer, context: Context, config: LandmarkSource, points: dict[int, Array]
+) -> Factor | Wait | tuple[str, str]:
+    """One sighting; a landmark that it makes is added to `points`."""
+    m = offer.measurement
+    assert isinstance(m, LandmarkObservation)
+    placed, mount = context.place(m.stamp), context.mount(m.frame)
+    if placed is None:
+        return "uncovered", "no trajectory at its stamp"
+    if mount is None:
+        return "unknown_frame", f"no extrinsics for '{m.frame}': add them to the config"
+    key, pose_key, space = context.landmark(m.landmark), placed.keyframe.pose, context.space
+    known = key in points or context.component(key) is not None
+    if key not in points and known and context.component(key) != context.component(pose_key):
+        return Wait(
+            offer, UNTIL_JOINED, "the landmark belongs to a part of the graph that is not connected yet"
+        )
+    value, covariance = _in_space(m, space, config)
+    if m.form == "bearing":
+        if not known:
+            return Wait(offer, key, "a bearing alone cannot place a landmark")
+        return _bearing(offer, placed, mount, (value, covariance), context, points)
+    here = mount is space.identity and placed.motion is None
+    if here and m.form == "bearing_range":
+        point, noise = space.direction(value[0], value[1]) * value[-1], space.bearing_noise(value, covariance)
+    else:
+        if m.form == "bearing_range":
+            value, covariance = space.to_cartesian(value, covariance)
+        point, covariance = moved(value, covariance, mount, placed.motion)
+        if not np.any(point):
+            return "range", "the landmark is where the robot is"
+        value, noise = space.to_polar(point, covariance)
+    if not known:
+        points[key] = context.pose(pose_key).transformFrom(point)
+    factor = space.observe(pose_key, key, value, noise_of(noise, config))
+    return Factor(offer.id, "landmark", factor, (pose_key, key))
+
+
+def _bearing(
+    offer: Offer,
+    placed: Placed,
+    mount: Pose,
+    seen: tuple[Array, Array],
+    context: Context,
+    points: dict[int, Array],
+) -> Factor:
+    """A bearing of a landmark that has a position. From beside the keyframe it is carried over at the landmark's
+    present distance: the offset is short beside it, and there is no native bearing factor with an offset.
+    """
+    (value, covariance), space = seen, context.space
+    m = offer.measurement
+    assert isinstance(m, LandmarkObservation)
+    key, pose_key = context.landmark(m.landmark), placed.keyframe.pose
+    noise = space.bearing_noise(value, covariance)
+    if mount is not space.identity or placed.motion is not None:
+        sensor = placed.motion.pose.compose(mount) if placed.motion else mount
+        point = points[key] if key in points else context.estimate.point(key)
+        distance = float(np.linalg.norm(context.pose(pose_key).compose(sensor).transformTo(point)))
+        carried = sensor.transformFrom(space.direction(value[0], value[1]) * max(distance, 1e-3))
+        value = space.angles(carried)
+    factor = space.observe_bearing(pose_key, key, value, noise_of(noise))
+    return Factor(offer.id, "landmark", factor, (pose_key, key))
+
+
+def moved(point: Array, covariance: Array, mount: Pose, motion: Motion | None) -> tuple[Array, Array]:
+    """A point in the sensor's frame, seen from the keyframe, with the motion's noise added (first order)."""
+    rotation = mount.rotation().matrix()
+    point, covariance = mount.transformFrom(point), rotation @ covariance @ rotation.T
+    if motion is None:
+        return point, covariance
+    size = len(point)
+    of_pose = np.zeros((size, len(motion.covariance)), order="F")
+    of_point = np.zeros((size, size), order="F")
+    there = motion.pose.transformFrom(point, of_pose, of_point)
+    return there, of_pose @ motion.covariance @ of_pose.T + of_point @ covariance @ of_point.T
+
+
+def _in_space(m: LandmarkObservation, space: Space, config: LandmarkSource) -> tuple[Array, Array]:
+    """The value and covariance without the axes that the space lacks, zeros and NaN replaced by the defaults."""
+    bearing, span = config.sigma_bearing**2, config.sigma_range**2
+    defaults = {
+        "position": (config.sigma_position**2,) * 3,
+        "bearing_range": (bearing, bearing, span),
+        "bearing": (bearing, bearing),
+    }[m.form]
+    keep = [k for k in range(len(m.value)) if space.name == "3d" or k != vertical(m.form)]
+    covariance = defaulted(m.covariance[np.ix_(keep, keep)], np.diag([defaults[k] for k in keep]))
+    return m.value[keep], covariance
+
+
+def vertical(form: Form) -> int:
+    """The axis of a value that a plane does not have."""
+    return 2 if form == "position" else 1

@@ -1,11 +1,15 @@
 """Wheel, visual or lidar odometry: the pose of the base in a drifting frame."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from ..measurement import Array, Decoder, Measurement, Message, frozen, seven_of, stamp_of
+from ..config import OdometrySource
+from ..context import Context
+from ..graph import Delta, Factor, Keyframe, Offer
+from ..measurement import Array, Decoder, Measurement, Message, format_stamp, frozen, seven_of, stamp_of
+from ..robust.kernels import noise_of
 
 UNKNOWN = frozen(np.zeros(36))  # a covariance of zeros means: use the configured default
 
@@ -67,3 +71,20 @@ DECODERS: Mapping[str, Decoder] = {
     "geometry_msgs/msg/PoseWithCovarianceStamped": decode_pose_with_covariance,
     "geometry_msgs/msg/PoseStamped": decode_pose,
 }
+
+
+def factors(
+    window: Sequence[Offer],
+    a: Keyframe | None,
+    b: Keyframe,
+    context: Context,
+    config: OdometrySource,  # noqa: ARG001  # its noise is in the track's motion
+) -> Delta:
+    """One between factor over (a, b], however many messages the window holds, and the first guess of b."""
+    if a is None or not window:
+        return Delta()
+    motion = context.motion(a.stamp, b.stamp)
+    guess = context.pose(a.pose).compose(motion.pose)
+    factor = context.space.between(a.pose, b.pose, motion.pose, noise_of(motion.covariance))
+    id = f"{window[-1].measurement.source}/{format_stamp(b.stamp)}/0"
+    return Delta((Factor(id, "motion", factor, (a.pose, b.pose)),), values={b.pose: guess})

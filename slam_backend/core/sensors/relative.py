@@ -1,11 +1,15 @@
 """The pose of one moment in another: loop closures, and motion where there is no odometry."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
+import gtsam
 import numpy as np
 
+from ..config import RelativeSource
+from ..context import Context, defaulted, refuse
 from ..errors import BadMessage
+from ..graph import Delta, Factor, Keyframe, Motion, Offer, Pose
 from ..measurement import (
     SECOND,
     Array,
@@ -17,6 +21,7 @@ from ..measurement import (
     seven_of,
     stamp_of,
 )
+from ..robust.kernels import noise_of, with_kernel
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -34,6 +39,10 @@ class RelativePose(Measurement):
     pose: Array  # (7,)
     covariance: Array  # (36,)
     information: Array | None = None
+
+    @property
+    def ends(self) -> tuple[int, int]:
+        return self.stamp_i, self.stamp_j
 
 
 def decode_odometry(message: Message, source: str) -> RelativePose:
@@ -93,3 +102,81 @@ DECODERS: Mapping[str, Decoder] = {
     "nav_msgs/msg/Odometry": decode_odometry,
     "sensor_msgs/msg/PointCloud2": decode_points,
 }
+
+
+def factors(
+    window: Sequence[Offer],
+    a: Keyframe | None,  # noqa: ARG001  # any two moments, not the newest step
+    b: Keyframe,  # noqa: ARG001
+    context: Context,
+    config: RelativeSource,
+) -> Delta:
+    """A between factor per measurement; both ends land at the nearest keyframes, at their own stamps."""
+    found: list[Factor] = []
+    decisions = []
+    for offer in window:
+        made = _factor(offer, context, config)
+        if isinstance(made, Factor):
+            found.append(made)
+        else:
+            decisions.append(refuse(offer, "relative", *made))
+    return Delta(tuple(found), decisions=tuple(decisions))
+
+
+def _factor(offer: Offer, context: Context, config: RelativeSource) -> Factor | tuple[str, str]:
+    m = offer.measurement
+    assert isinstance(m, RelativePose)
+    a, b = context.place(m.stamp_i), context.place(m.stamp_j)
+    if a is None or b is None:
+        return "uncovered", "no trajectory at one of its stamps"
+    if a.keyframe is b.keyframe:
+        return "one_keyframe", "both ends land at the same keyframe"
+    mount_i, mount_j = context.mount(m.frame_i), context.mount(m.frame_j)
+    if mount_i is None or mount_j is None:
+        return (
+            "unknown_frame",
+            f"no extrinsics for '{m.frame_i if mount_i is None else m.frame_j}': add them to the config",
+        )
+    space = context.space
+    pose = space.pose(m.pose.tolist())
+    if (
+        a.motion is None
+        and b.motion is None
+        and mount_i is mount_j is space.identity
+        and m.information is not None
+    ):
+        noise = with_kernel(gtsam.noiseModel.Gaussian.Information(space.information(m.information)), config)
+    else:
+        moved = _shifted(_measured(m, pose, context, config), mount_i, mount_j)
+        moved = a.motion.then(moved) if a.motion else moved
+        moved = moved.then(b.motion.inverse()) if b.motion else moved
+        pose, noise = moved.pose, noise_of(moved.covariance, config)
+    keys = (a.keyframe.pose, b.keyframe.pose)
+    kind = "motion" if offer.motion else "loop"
+    return Factor(offer.id, kind, space.between(*keys, pose, noise), keys, (m.stamp_i, m.stamp_j))
+
+
+def _measured(m: RelativePose, pose: Pose, context: Context, config: RelativeSource) -> Motion:
+    space = context.space
+    if m.information is not None:
+        return Motion(pose, np.linalg.inv(space.information(m.information)))
+    covariance = (
+        space.covariance(m.covariance, pose) if m.covariance.any() else np.zeros((space.dimension,) * 2)
+    )
+    return Motion(
+        pose, defaulted(covariance, space.diagonal(config.sigma_rotation**2, config.sigma_translation**2))
+    )
+
+
+def _shifted(measured: Motion, mount_i: Pose, mount_j: Pose) -> Motion:
+    """From between two sensors to between the bases that carry them."""
+    exact = np.zeros_like(measured.covariance)
+    return Motion(mount_i, exact).then(measured).then(Motion(mount_j.inverse(), exact))
+
+
+def step(m: RelativePose, context: Context) -> Pose | None:
+    """`base_i_T_base_j` as measured; None when a frame is unknown."""
+    mount_i, mount_j = context.mount(m.frame_i), context.mount(m.frame_j)
+    if mount_i is None or mount_j is None:
+        return None
+    return mount_i.compose(context.space.pose(m.pose.tolist())).compose(mount_j.inverse())

@@ -1,0 +1,223 @@
+"""Motion between any two stamps, and when a keyframe is due.
+
+How a measurement between keyframes lands: the interpolated odometry between its own stamp and the nearest
+keyframe is composed into the measurement, and the odometry's noise over that stretch into its covariance. So a
+measurement of any age lands at its own stamp and costs no variable. The stretch is at most half a keyframe
+step, and its correlation with the edge between the keyframes (the same odometry is used twice) is neglected: it is
+second order beside the measurement's own noise. Where it is not (centimetre landmarks on a coarse
+keyframe grid), a source with `keyframe: true` has a keyframe made at the stamp of each of its measurements.
+"""
+
+from array import array
+from bisect import bisect_left, bisect_right, insort
+from dataclasses import dataclass
+
+import numpy as np
+
+from .config import Keyframes, OdometrySource
+from .graph import Keyframe, Motion, Pose
+from .measurement import SECOND, Array
+from .space import Space, interpolate
+
+SAMPLES_PER_STEP = 32  # odometry samples kept between two keyframes; a parked robot must not fill the memory
+
+
+class Track:
+    """The odometry as a function of time: samples, interpolated along constant twists.
+
+    Noise over a stretch, by `OdometrySource.noise`:
+        model  variances that grow with the distance and the angle between its ends, and a floor
+        twist  each message's twist covariance held over the time since the last, as independent errors
+        pose   the pose covariance at the end minus that at the start, seen from the end; the model where
+               the difference is not positive definite (covariances that shrink or stand still)
+    """
+
+    def __init__(self, space: Space, noise: OdometrySource) -> None:
+        self._space, self._noise = space, noise
+        self._stamps = array("q")
+        self._numbers: list[tuple[float, ...]] = []
+        self._covariances: list[Array] = []  # per sample; only for noise `twist` (of the step) and `pose`
+        self._protected = 0  # index of the newest sample that may not be thinned away
+
+    def __len__(self) -> int:
+        return len(self._stamps)
+
+    def add(self, stamp: int, pose: Pose, covariance: Array | None = None) -> None:
+        """Append a sample, or insert it in stamp order. covariance: as `noise` needs it, at the child's tangent."""
+        at = len(self._stamps)
+        if at and stamp < self._stamps[-1]:
+            at = bisect_left(self._stamps, stamp)
+        self._stamps.insert(at, stamp)
+        self._numbers.insert(at, self._space.numbers(pose))
+        if covariance is not None:
+            self._covariances.insert(at, covariance)
+        if len(self._stamps) - self._protected > 2 * SAMPLES_PER_STEP:
+            self._thin()
+
+    def protect(self) -> None:
+        """A keyframe stands at the newest sample: what follows is a new step."""
+        self._protected = max(len(self._stamps) - 1, 0)
+
+    def covers(self, stamp: int) -> bool:
+        return bool(self._stamps) and self._stamps[0] <= stamp <= self._stamps[-1]
+
+    @property
+    def newest(self) -> int:
+        return self._stamps[-1]
+
+    def pose(self, stamp: int) -> Pose:
+        """`odom_T_base` at a stamp that the track covers."""
+        right = bisect_left(self._stamps, stamp)
+        if self._stamps[right] == stamp:
+            return self._sample(right)
+        before, after = self._stamps[right - 1], self._stamps[right]
+        ratio = (stamp - before) / (after - before)
+        return interpolate(self._space, self._sample(right - 1), self._sample(right), ratio)
+
+    def motion(self, start: int, end: int) -> Motion:
+        """`start_T_end` and its covariance at the tangent of end; both stamps must be covered."""
+        if start == end:
+            return Motion(self._space.identity, np.zeros((self._space.dimension,) * 2))
+        if start > end:
+            return self.motion(end, start).inverse()
+        first, last = self.pose(start), self.pose(end)
+        pose = first.between(last)
+        return Motion(pose, self._covariance(start, end, pose, last))
+
+    def _sample(self, index: int) -> Pose:
+        return self._space.pose_of_numbers(self._numbers[index])
+
+    def _covariance(self, start: int, end: int, motion: Pose, last: Pose) -> Array:
+        if self._noise.noise == "twist" and self._covariances:
+            return self._floor() + self._of_twists(start, end, last)
+        if self._noise.noise == "pose" and self._covariances:
+            grown = self._of_poses(start, end, motion)
+            if grown is not None:
+                return self._floor() + grown
+        return self._of_model(motion)
+
+    def _floor(self) -> Array:
+        noise = self._noise
+        return self._space.diagonal(noise.sigma_rotation_floor**2, noise.sigma_translation_floor**2)
+
+    def _of_model(self, motion: Pose) -> Array:
+        noise = self._noise
+        meters, radians = self._space.size(motion)
+        return self._space.diagonal(
+            noise.sigma_rotation_per_meter**2 * meters
+            + noise.sigma_rotation_per_radian**2 * radians
+            + noise.sigma_rotation_floor**2,
+            noise.sigma_translation_per_meter**2 * meters
+            + noise.sigma_translation_per_radian**2 * radians
+            + noise.sigma_translation_floor**2,
+        )
+
+    def _of_twists(self, start: int, end: int, last: Pose) -> Array:
+        total = np.zeros((self._space.dimension,) * 2)
+        for i in range(max(bisect_right(self._stamps, start), 1), bisect_left(self._stamps, end) + 1):
+            before, after = self._stamps[i - 1], self._stamps[i]
+            share = (min(after, end) - max(before, start)) / (after - before)
+            if after >= end:
+                total += share * self._covariances[i]
+            else:
+                adjoint = last.between(self._sample(i)).AdjointMap()
+                total += share * (adjoint @ self._covariances[i] @ adjoint.T)
+        return total
+
+    def _of_poses(self, start: int, end: int, motion: Pose) -> Array | None:
+        adjoint = motion.inverse().AdjointMap()
+        grown = self._stated(end) - adjoint @ self._stated(start) @ adjoint.T
+        grown = (grown + grown.T) / 2
+        return grown if np.linalg.eigvalsh(grown)[0] > 0 else None
+
+    def _stated(self, stamp: int) -> Array:
+        right = bisect_left(self._stamps, stamp)
+        if self._stamps[right] == stamp:
+            return self._covariances[right]
+        before, after = self._stamps[right - 1], self._stamps[right]
+        ratio = (stamp - before) / (after - before)
+        return (1 - ratio) * self._covariances[right - 1] + ratio * self._covariances[right]
+
+    def _thin(self) -> None:
+        """Drop every second sample of the current step; step covariances are handed to the next sample."""
+        drop = range(self._protected + 1, len(self._stamps) - 1, 2)
+        if self._covariances and self._noise.noise == "twist":
+            for i in drop:
+                adjoint = self._sample(i + 1).between(self._sample(i)).AdjointMap()
+                self._covariances[i + 1] = (
+                    self._covariances[i + 1] + adjoint @ self._covariances[i] @ adjoint.T
+                )
+        where = slice(drop.start, drop.stop, 2)
+        del self._stamps[where], self._numbers[where]
+        if self._covariances:
+            del self._covariances[where]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Placed:
+    """Where a stamp lies: `keyframe_T_stamp`; motion is None when the stamp is the keyframe's own."""
+
+    keyframe: Keyframe
+    motion: Motion | None
+
+
+class Timeline:
+    """The keyframes by index and by stamp."""
+
+    def __init__(self) -> None:
+        self.keyframes: list[Keyframe] = []
+        self._stamps: list[int] = []
+        self._by_stamp: dict[int, Keyframe] = {}
+
+    def __len__(self) -> int:
+        return len(self.keyframes)
+
+    def add(self, keyframe: Keyframe) -> None:
+        self.keyframes.append(keyframe)
+        self._by_stamp[keyframe.stamp] = keyframe
+        if not self._stamps or keyframe.stamp > self._stamps[-1]:
+            self._stamps.append(keyframe.stamp)
+        else:
+            insort(self._stamps, keyframe.stamp)
+
+    def drop(self, keyframe: Keyframe) -> None:
+        """Take back the keyframe that was added last."""
+        assert self.keyframes[-1] is keyframe
+        self.keyframes.pop()
+        del self._by_stamp[keyframe.stamp]
+        self._stamps.remove(keyframe.stamp)
+
+    def at(self, stamp: int) -> Keyframe | None:
+        return self._by_stamp.get(stamp)
+
+    def in_order(self) -> list[Keyframe]:
+        return [self._by_stamp[stamp] for stamp in self._stamps]
+
+    def place(self, stamp: int, track: Track, space: Space) -> Placed | None:
+        """The nearest keyframe (by distance moved, then by time) with the motion to the stamp.
+
+        None when the stamp lies outside the keyframes or the track does not cover it.
+        """
+        if exact := self._by_stamp.get(stamp):
+            return Placed(exact, None)
+        right = bisect_left(self._stamps, stamp)
+        if right in (0, len(self._stamps)) or not track.covers(stamp):
+            return None
+        here = track.pose(stamp)
+
+        def distance(near: int) -> tuple[float, float, int]:
+            meters, radians = space.size(track.pose(near).between(here))
+            return meters, radians, abs(stamp - near)
+
+        nearest = min(self._stamps[right - 1 : right + 1], key=distance)
+        return Placed(self._by_stamp[nearest], track.motion(nearest, stamp))
+
+
+def due(config: Keyframes, space: Space, motion: Pose, elapsed: int) -> bool:
+    """Whether the motion or the time (ns) since the last keyframe asks for a new one."""
+    if config.every:
+        return True
+    if config.time is not None and elapsed >= config.time * SECOND:
+        return True
+    meters, radians = space.size(motion)
+    return meters >= config.distance or radians >= config.angle
