@@ -141,21 +141,31 @@ def _sight(
     if m.form == "bearing":
         if not known:
             return Wait(offer, key, "a bearing alone cannot place a landmark")
-        return _bearing(offer, placed, mount, (value, covariance), context, points)
-    here = mount is space.identity and placed.motion is None
-    if here and m.form == "bearing_range":
-        point, noise = space.direction(value[0], value[1]) * value[-1], space.bearing_noise(value, covariance)
-    else:
-        if m.form == "bearing_range":
-            value, covariance = space.to_cartesian(value, covariance)
-        point, covariance = moved(value, covariance, mount, placed.motion)
-        if not np.any(point):
-            return "range", "the landmark is where the robot is"
-        value, noise = space.to_polar(point, covariance)
+        return _bearing(offer, placed, mount, (value, covariance), context, config, points)
+    polar = _polar(m.form, (value, covariance), mount, placed.motion, space)
+    if polar is None:
+        return "range", "the landmark is where the robot is"
+    value, noise, point = polar
     if not known:
         points[key] = context.pose(pose_key).transformFrom(point)
     factor = space.observe(pose_key, key, value, noise_of(noise, config))
     return Factor(offer.id, "landmark", factor, (pose_key, key))
+
+
+def _polar(
+    form: Form, seen: tuple[Array, Array], mount: Pose, motion: Motion | None, space: Space
+) -> tuple[Array, Array, Array] | None:
+    """Value and covariance for the native factor, and the point, from the keyframe; None at zero distance."""
+    value, covariance = seen
+    if form == "bearing_range":
+        if mount is space.identity and motion is None:
+            point = space.direction(value[0], value[1]) * value[-1]
+            return value, space.bearing_noise(value, covariance), point
+        value, covariance = space.to_cartesian(value, covariance)
+    point, covariance = moved(value, covariance, mount, motion)
+    if not np.any(point):
+        return None
+    return (*space.to_polar(point, covariance), point)
 
 
 def _bearing(
@@ -180,7 +190,7 @@ def _bearing(
         distance = float(np.linalg.norm(context.pose(pose_key).compose(sensor).transformTo(point)))
         carried = sensor.transformFrom(space.direction(value[0], value[1]) * max(distance, 1e-3))
         value = space.angles(carried)
-    factor = space.observe_bearing(pose_key, key, value, noise_of(noise))
+    factor = space.observe_bearing(pose_key, key, value, noise_of(noise, config))
     return Factor(offer.id, "landmark", factor, (pose_key, key))
 
 

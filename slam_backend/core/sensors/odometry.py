@@ -86,5 +86,5 @@ def factors(
     motion = context.motion(a.stamp, b.stamp)
     guess = context.pose(a.pose).compose(motion.pose)
     factor = context.space.between(a.pose, b.pose, motion.pose, noise_of(motion.covariance))
-    id = f"{window[-1].measurement.source}/{format_stamp(b.stamp)}/0"
-    return Delta((Factor(id, "motion", factor, (a.pose, b.pose)),), values={b.pose: guess})
+    name = f"{window[-1].measurement.source}/{format_stamp(b.stamp)}/0"
+    return Delta((Factor(name, "motion", factor, (a.pose, b.pose)),), values={b.pose: guess})

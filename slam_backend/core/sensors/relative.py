@@ -159,7 +159,7 @@ def _factor(offer: Offer, context: Context, config: RelativeSource) -> Factor | 
 def _measured(m: RelativePose, pose: Pose, context: Context, config: RelativeSource) -> Motion:
     space = context.space
     if m.information is not None:
-        return Motion(pose, np.linalg.inv(space.information(m.information)))
+        return Motion(pose, np.asarray(np.linalg.inv(space.information(m.information))))
     covariance = (
         space.covariance(m.covariance, pose) if m.covariance.any() else np.zeros((space.dimension,) * 2)
     )

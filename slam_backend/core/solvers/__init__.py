@@ -1,0 +1,30 @@
+"""A solver takes changes to the graph and gives estimates; SOLVERS is the list of them."""
+
+from collections.abc import Callable, Mapping
+from typing import Protocol
+
+from ..config import Config
+from ..graph import Decision, Delta, Estimate, Factor
+from ..space import Space
+from . import isam2
+
+
+class Solver(Protocol):
+    factors: Mapping[str, Factor]  # the store: what is in the graph now
+
+    def update(self, delta: Delta) -> Estimate:
+        """Apply a change whole; SolverFailure, with nothing applied, names the factors that cannot be solved."""
+        ...
+
+    def polish(self) -> Estimate:
+        """Linearize everything anew at the present estimate, until that changes nothing."""
+        ...
+
+    def incidents(self) -> tuple[Decision, ...]:
+        """What went wrong and was mended since the last call."""
+        ...
+
+
+SOLVERS: Mapping[str, Callable[[Config, Space], Solver]] = {
+    "isam2": isam2.Isam2,
+}
