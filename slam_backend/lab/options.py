@@ -16,10 +16,10 @@ class Options:
 
     poses: int = 5000  # odometry messages, and poses of the ground truth
     period: float = 0.1  # s between two odometry messages
-    sigma_translation_per_meter: float = 0.02  # m after 1 m of path
-    sigma_translation_per_radian: float = 0.01  # m after 1 rad turned
-    sigma_rotation_per_meter: float = 0.002  # rad after 1 m of path
-    sigma_rotation_per_radian: float = 0.01  # rad after 1 rad turned
+    sigma_translation_per_meter: float = 0.03  # m after 1 m of path
+    sigma_translation_per_radian: float = 0.02  # m after 1 rad turned
+    sigma_rotation_per_meter: float = 0.004  # rad after 1 m of path
+    sigma_rotation_per_radian: float = 0.02  # rad after 1 rad turned
     loop_rate: float = 0.1  # fraction of the returns to a place that are noticed
     loop_range: float = 2.0  # m: how near counts as the same place
     loop_sigma_translation: float = 0.05  # m

@@ -36,7 +36,9 @@ def step_sigmas(steps: Array, options: Options) -> tuple[Array, Array]:
         steps[:, [2, 0, 1], [1, 2, 0]] - steps[:, [1, 2, 0], [2, 0, 1]], axis=1
     )  # the cosine alone loses small angles
     turned = np.arctan2(sine, np.trace(steps[:, :3, :3], axis1=1, axis2=2) - 1)
-    translation = options.sigma_translation_per_meter**2 * path + options.sigma_translation_per_radian**2 * turned
+    translation = (
+        options.sigma_translation_per_meter**2 * path + options.sigma_translation_per_radian**2 * turned
+    )
     rotation = options.sigma_rotation_per_meter**2 * path + options.sigma_rotation_per_radian**2 * turned
     return np.sqrt(translation), np.sqrt(rotation)
 
@@ -63,7 +65,7 @@ def odometry(poses: Array, stamps: list[int], options: Options) -> Iterator[Odom
     twists = np.concatenate([turned[:, :3], turned[:, 3:6] * scale[:, None]], axis=1) / options.period
     variances = np.repeat(np.stack([translation, rotation], axis=1) ** 2, 3, axis=1) / options.period**2
     for k, stamp in enumerate(stamps):
-        covariance = UNKNOWN if k == 0 else frozen(np.diag(variances[k]).reshape(36))
+        covariance = frozen(np.diag(variances[max(k, 1)]).reshape(36))  # zero would say: unknown
         yield OdometryPose(
             stamp, "wheels", "odom", BASE, frozen(sevens[k]), UNKNOWN, frozen(twists[k]), covariance
         )
