@@ -1,10 +1,15 @@
 """Metadata for pip and for colcon (ament_python); `pyproject.toml` holds settings of tools only."""
 
-from glob import glob
+from pathlib import Path
 
 from setuptools import find_packages, setup
 
 NAME = "slam_backend"
+
+
+def files(pattern: str) -> list[str]:
+    return sorted(map(str, Path().glob(pattern)))
+
 
 setup(
     name=NAME,
@@ -21,8 +26,8 @@ setup(
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),
         (f"share/{NAME}", ["package.xml"]),
-        (f"share/{NAME}/launch", glob("launch/*.py")),
-        (f"share/{NAME}/config", glob("config/*.yaml")),
+        (f"share/{NAME}/launch", files("launch/*.py")),
+        (f"share/{NAME}/config", files("config/*.yaml")),
     ],
     zip_safe=False,
     entry_points={"console_scripts": ["slam-backend = slam_backend.cli:main"]},
