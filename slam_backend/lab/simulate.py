@@ -180,15 +180,19 @@ def write_simulation(simulation: Simulation, out: Path) -> Written:
     head = f"# {simulation.scenario}, seed {simulation.seed}: replays {out.name} with the noise it was made with.\n"
     text = yaml.safe_dump(dict(simulation.settings), sort_keys=False, default_flow_style=None, width=100)
     written.config.write_text(head + text)
-    wrong = [(loop.i, loop.j) for loop in simulation.loops if loop.wrong]
+    wrong = [loop for loop in simulation.loops if loop.wrong]
     if not wrong:
-        return written._replace(wrong=None)
-    stamped = [
-        f"{format_stamp(int(simulation.stamps[i]))},{format_stamp(int(simulation.stamps[j]))}"
-        for i, j in wrong
-    ]
-    written.wrong.write_text("\n".join(["stamp_i,stamp_j", *stamped, ""]))
-    return written
+        return written
+    ends = [",".join(format_stamp(int(simulation.stamps[k])) for k in (loop.i, loop.j)) for loop in wrong]
+    path = beside(out, ".wrong.csv")
+    path.write_text("\n".join(["stamp_i,stamp_j", *ends, ""]))
+    return written._replace(wrong=path)
+
+
+def beside(bag: Path, ending: str) -> Path:
+    """`drive.mcap` and `.yaml` to `drive.yaml`; a folder's whole name is kept."""
+    name = bag.stem if bag.suffix == ".mcap" else bag.name
+    return bag.with_name(name + ending)
 
 
 def tum(stamps: list[int], sevens: Array) -> str:

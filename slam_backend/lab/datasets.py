@@ -1,0 +1,155 @@
+"""Public data sets that come inside gtsam's wheel, as bags.
+
+What the files leave unsaid, and how it is read here:
+
+Noise of Victoria Park. `ODOMETRY i j dx dy dtheta v1..v6` and `LANDMARK i l x y v1 v2 v3`: the v are the upper triangle,
+row by row, of a covariance: of the increment (m, m, rad) at pose j, and of x, y in the vehicle's frame. The odometry
+decides it: 1e-4 and 4e-6 are 1 cm, 2 mm and 2 mrad a step as variances, but 0.1 mm and 4 micrometres as standard deviations,
+and 100 m and 500 m as information. The trees are the same writer's: 0.4 is a variance, 0.63 m. The optimum agrees: chi2 is 6347
+on 6978 degrees of freedom (8825 with 0.4 m, 4299 with 1 / sqrt(0.4) m).
+
+Noise of the pose graphs. In sphere2500.txt the triangle is the upper triangular *root* of the information: the edges differ
+from those of sphere2500_groundtruth.txt by 0.1 m and 0.01, 0.01, 0.04 rad, which is 1 / (10, 100, 100, 25). (Taken as
+information the numbers claim 0.32 m and 0.1, 0.1, 0.2 rad.) city10000 states none: against ISAM2_GT_city10000.txt its edges
+are 0.02 m and 0.01 rad off. w10000 states the identity, which is its own root. All at the tangent of the second pose.
+
+Noise of Plaza. None is stated: 0.01 m and 0.003 rad per 0.2 s, growing with the root of time, is what worked.
+
+Time. Only Plaza tells it. The poses of Victoria Park are scans of a laser that ran at 4.7 Hz: 0.2 s apart. Graphs: 0.1 s.
+
+Planar data say nothing of z, roll and pitch: they get the noise of y and of yaw, so that a replay in 3-D works too.
+"""
+
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from ..core.errors import BadConfig
+from ..core.geometry import covariance_to_ros, seven_of_matrix
+from ..core.measurement import SECOND, Array
+from ..core.sensors.odometry import UNKNOWN
+from ..io.bags import write_bag
+from ..io.cdr import encode_cloud, encode_odometry
+from ..io.records import Record
+from . import pose_graphs
+from .gtsam_data import Content, lifted, planar, rows, symmetric
+from .simulate import CLOUD, ODOMETRY, START, beside, tum
+from .world import chain
+
+SCAN = SECOND // 5  # ns between the poses of Victoria Park
+BASE = "base_link"
+
+
+@dataclass(frozen=True, slots=True)
+class Dataset:
+    description: str
+    read: Callable[[], Content]
+
+
+class Made(NamedTuple):
+    """What was written: `seconds` from the first to the last message; `truth` as TUM where there is one."""
+
+    path: Path
+    messages: int
+    description: str
+    seconds: float
+    truth: Path | None = None
+
+
+def make_dataset(name: str, out: Path, advance: Callable[[int], None] = lambda _: None) -> Made:
+    """Write one of DATASETS as a bag at `out`; `advance` hears of every message. BadConfig for another name."""
+    if name not in DATASETS:
+        raise BadConfig(f"there is no data set '{name}'; known: {', '.join(DATASETS)}")
+    content = DATASETS[name].read()
+    records = sorted(content.records, key=lambda record: record.log_time)
+    write_bag(out, _counted(records, advance))
+    truth = None
+    if content.truth is not None:
+        truth = beside(out, ".truth.tum")
+        truth.write_text(tum(*content.truth))
+    seconds = (records[-1].log_time - records[0].log_time) / SECOND
+    return Made(out, len(records), DATASETS[name].description, seconds, truth)
+
+
+def _counted(records: Iterable[Record], advance: Callable[[int], None]) -> Iterator[Record]:
+    for record in records:
+        yield record
+        advance(1)
+
+
+def _victoria_park() -> Content:
+    lines = rows("victoria_park.txt")
+    odometry = np.array([row[3:] for row in lines if row[0] == "ODOMETRY"], dtype=np.float64)
+    # Poses and trees share one numbering, poses in order of appearance.
+    ranks = {"0": 0} | {row[2]: k + 1 for k, row in enumerate(row for row in lines if row[0] == "ODOMETRY")}
+    stamps = [START + k * SCAN for k in range(len(ranks))]
+    records = _odometry(stamps, odometry[:, :3], lifted(symmetric(odometry[:, 3:])))
+    seen: dict[int, list[list[str]]] = {}
+    for row in lines:
+        if row[0] == "LANDMARK":
+            seen.setdefault(stamps[ranks[row[1]]], []).append(row)
+    for stamp, trees in seen.items():
+        values = np.array([row[3:] for row in trees], dtype=np.float64)
+        covariances = np.zeros((len(trees), 3, 3))
+        covariances[:, :2, :2] = symmetric(values[:, 2:])
+        covariances[:, 2, 2] = covariances[:, 0, 0]
+        columns = {
+            "id": np.array([row[2] for row in trees], dtype=np.uint32),
+            "x": values[:, 0],
+            "y": values[:, 1],
+            "cov": covariances.reshape(-1, 9),
+        }
+        records.append(Record("/trees", CLOUD, stamp + SECOND // 1000, encode_cloud(stamp, BASE, columns)))
+    return Content(records)
+
+
+def _plaza(name: str) -> Content:
+    """Rows of time (s), distance (m) and turn (rad) since the row before."""
+    table = np.array(rows(name), dtype=np.float64)
+    stamps = [round(t * 1e9) for t in table[:, 0].tolist()]
+    steps = np.stack([table[1:, 1], np.zeros(len(table) - 1), table[1:, 2]], axis=1)
+    share = np.diff(table[:, 0])[:, None, None] / 0.2
+    return Content(_odometry(stamps, steps, lifted(np.diag([0.01, 0.01, 0.003]) ** 2 * share)))
+
+
+def _odometry(stamps: list[int], steps: Array, covariances: Array) -> list[Record]:
+    """N stamps, N - 1 steps x y yaw, and their (N - 1, 6, 6) covariances in GTSAM's order, as messages on /odom.
+
+    The twist is the step over its time and its covariance the step's over the time squared; the pose states none.
+    """
+    sevens = seven_of_matrix(chain(np.array([planar(*step).matrix() for step in steps])))
+    seconds = np.diff(stamps) / SECOND
+    twists = np.zeros((len(stamps), 6))
+    twists[1:, [0, 1, 5]] = steps / seconds[:, None]
+    noises = covariance_to_ros(covariances, np.eye(3)) / seconds[:, None, None] ** 2
+    noises = np.concatenate([noises[:1], noises]).reshape(-1, 36)
+    return [
+        Record("/odom", ODOMETRY, stamp, encode_odometry(stamp, "odom", BASE, seven, UNKNOWN, twist, noise))
+        for stamp, seven, twist, noise in zip(stamps, sevens, twists, noises, strict=True)
+    ]
+
+
+DATASETS: Mapping[str, Dataset] = {
+    "victoria_park": Dataset(
+        "a truck among trees: 6,969 poses on /odom, 3,640 sightings of 151 trees on /trees; 2-D", _victoria_park
+    ),
+    "plaza1": Dataset(
+        "a lawn mower, 32 min: 9,657 poses on /odom; 2-D; its radio ranges are left out", partial(_plaza, "Plaza1_DR.txt")
+    ),
+    "plaza2": Dataset(
+        "a lawn mower, 7 min: 4,090 poses on /odom; 2-D; its radio ranges are left out", partial(_plaza, "Plaza2_DR.txt")
+    ),
+    "sphere2500": Dataset(
+        "simulated, on a sphere: 2,500 poses, 4,949 relative poses on /edges, truth on /truth; 3-D", pose_graphs.sphere2500
+    ),
+    "city10000": Dataset(
+        "simulated, in a city: 10,000 poses, 20,687 relative poses on /edges, truth on /truth; 2-D", pose_graphs.city10000
+    ),
+    "w10000": Dataset(
+        "simulated, in a grid: 10,000 poses, 64,311 relative poses on /edges; 2-D", pose_graphs.w10000
+    ),
+}  # fmt: skip
