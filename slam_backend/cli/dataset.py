@@ -1,7 +1,6 @@
 """`slam-backend dataset NAME`: public data as a bag."""
 
 import json
-from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated
 
@@ -26,6 +25,6 @@ def command(
     with progress(name, None) as advance:
         made = make_dataset(name, out or Path(f"{name}.mcap"), advance)
     if as_json:
-        typer.echo(json.dumps(asdict(made), default=str))
+        typer.echo(json.dumps(made._asdict(), default=str))
     else:
-        typer.echo(f"{made.path}: {made.messages} messages in {made.seconds:.1f} s; {made.description}")
+        typer.echo(f"{made.path}: {made.messages} messages over {made.seconds:.0f} s; {made.description}")
