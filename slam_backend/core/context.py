@@ -1,14 +1,15 @@
 """What a sensor may know of the rest when it makes its factors."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from .graph import Decision, Estimate, Motion, Offer, Pose
+from .graph import Decision, Delta, Estimate, Factor, Motion, Offer, Pose, Wait
 from .keyframes import Placed
 from .measurement import Array
+from .mounts import Mounts
 from .space import Space
 
 
@@ -23,9 +24,9 @@ class Context:
     """
 
     space: Space
-    estimate: Estimate
+    estimate: Estimate | None  # None at the first keyframe
     guesses: Mapping[int, Any]
-    mounts: Mapping[str, Pose]
+    mounts: Mounts
     place: Callable[[int], Placed | None]
     motion: Callable[[int, int], Motion]
     landmark: Callable[[str], int]
@@ -33,17 +34,57 @@ class Context:
 
     def pose(self, key: int) -> Pose:
         guess = self.guesses.get(key)
-        return self.estimate.pose(key) if guess is None else guess
+        if guess is not None:
+            return guess
+        assert self.estimate is not None
+        return self.estimate.pose(key)
 
-    def mount(self, frame: str) -> Pose | None:
-        """`base_T_frame`; the space's identity for the base itself, None for an unknown frame."""
-        return self.mounts.get(frame)
+    def point(self, key: int) -> Array:
+        assert self.estimate is not None
+        return self.estimate.point(key)
+
+    def landing(self, stamp: int) -> Placed:
+        """Where a measurement of that stamp lands; Unusable where no trajectory covers it."""
+        placed = self.place(stamp)
+        if placed is None:
+            raise Unusable("uncovered", "no trajectory at its stamp")
+        return placed
+
+    def mount(self, frame: str) -> Pose:
+        """`base_T_frame`: the space's own identity object for the base itself; Unusable for an unknown frame."""
+        mount = self.mounts.get(frame)
+        if mount is None:
+            raise Unusable(
+                "unknown_frame", f"where is '{frame}' on the robot? add it to 'extrinsics' or send /tf_static"
+            )
+        return mount
 
 
-def refuse(offer: Offer, stage: str, reason: str, detail: str) -> Decision:
-    """A decision against a measurement that cannot become a factor."""
-    m = offer.measurement
-    return Decision(m.stamp, offer.id, m.source, "refused", stage, reason, detail, ends=m.ends)
+class Unusable(Exception):  # never leaves the sensors: how one says that a measurement makes no factor
+    def __init__(self, reason: str, detail: str) -> None:
+        super().__init__(detail)
+        self.reason, self.detail = reason, detail
+
+
+def each(window: Iterable[Offer], stage: str, make: Callable[[Offer], Factor | Wait]) -> Delta:
+    """The Delta of a sensor whose measurements become one factor each; what is unusable becomes a Decision."""
+    found: list[Factor] = []
+    waits: list[Wait] = []
+    decisions: list[Decision] = []
+    for offer in window:
+        try:
+            made = make(offer)
+        except Unusable as why:
+            m = offer.measurement
+            decisions.append(
+                Decision(m.stamp, offer.id, m.source, "refused", stage, why.reason, why.detail, ends=m.ends)
+            )
+            continue
+        if isinstance(made, Wait):
+            waits.append(made)
+        else:
+            found.append(made)
+    return Delta(tuple(found), waits=tuple(waits), decisions=tuple(decisions))
 
 
 def defaulted(covariance: Array, defaults: Array) -> Array:

@@ -30,6 +30,10 @@ def landmark_key(index: int) -> int:
     return int(L(index))
 
 
+def is_pose(key: int) -> bool:
+    return key >> 56 == ord("x")  # gtsam keeps a symbol's letter in the top byte
+
+
 class Offer(NamedTuple):
     """A measurement on its way into the graph. `motion`: it made a keyframe, so it must enter."""
 
@@ -44,14 +48,19 @@ class Factor:
 
     id: `<source>/<stamp>/<n>`, n counting the measurements of that source with that stamp.
     kind: motion, loop, landmark, pose or gauge; what reports, robust stages and exports sort by.
-    stamps: of the two measured ends, for relative measurements.
+    stamp: of the measurement; stamps: of its two ends, for relative measurements.
     """
 
     id: str
     kind: str
-    factor: gtsam.NonlinearFactor
+    factor: Any  # a gtsam.NonlinearFactor
     keys: tuple[int, ...]
+    stamp: int
     stamps: tuple[int, int] | None = None
+
+    @property
+    def source(self) -> str:
+        return self.id.partition("/")[0]
 
 
 UNTIL_JOINED = 0  # no variable has this key

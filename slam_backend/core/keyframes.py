@@ -187,6 +187,10 @@ class Timeline:
         del self._by_stamp[keyframe.stamp]
         self._stamps.remove(keyframe.stamp)
 
+    @property
+    def newest(self) -> Keyframe | None:
+        return self._by_stamp[self._stamps[-1]] if self._stamps else None
+
     def at(self, stamp: int) -> Keyframe | None:
         return self._by_stamp.get(stamp)
 

@@ -31,6 +31,8 @@ class Space(Protocol):
 
     def from_extrinsics(self, six: Sequence[float]) -> Pose: ...
 
+    def seven(self, pose: Pose) -> tuple[float, ...]: ...
+
     def numbers(self, pose: Pose) -> tuple[float, ...]:
         """What `pose_of_numbers` takes back: the smallest exact form for storage."""
         ...
@@ -89,6 +91,10 @@ class Space(Protocol):
 
     def estimate_point(self, solver: Any, key: int) -> Array: ...
 
+    def pose_in(self, values: gtsam.Values, key: int) -> Pose: ...
+
+    def point_in(self, values: gtsam.Values, key: int) -> Array: ...
+
     def sevens(self, values: gtsam.Values, keys: Sequence[int]) -> Array: ...
 
 
@@ -112,6 +118,10 @@ class Planar:
 
     def from_extrinsics(self, six: Sequence[float]) -> Pose:
         return gtsam.Pose2(six[0], six[1], six[5])
+
+    def seven(self, pose: Pose) -> tuple[float, ...]:
+        half = pose.theta() / 2
+        return (pose.x(), pose.y(), 0.0, 0.0, 0.0, sin(half), cos(half))
 
     def numbers(self, pose: Pose) -> tuple[float, ...]:
         return (pose.x(), pose.y(), pose.theta())
@@ -179,6 +189,12 @@ class Planar:
     def estimate_point(self, solver: Any, key: int) -> Array:
         return np.asarray(solver.calculateEstimatePoint2(key))
 
+    def pose_in(self, values: gtsam.Values, key: int) -> Pose:
+        return values.atPose2(key)
+
+    def point_in(self, values: gtsam.Values, key: int) -> Array:
+        return np.asarray(values.atPoint2(key))
+
     def sevens(self, values: gtsam.Values, keys: Sequence[int]) -> Array:
         rows = np.array([self.numbers(values.atPose2(key)) for key in keys]).reshape(-1, 3)
         sevens = np.zeros((len(rows), 7))
@@ -204,6 +220,10 @@ class Spatial:
     def from_extrinsics(self, six: Sequence[float]) -> Pose:
         x, y, z, roll, pitch, yaw = six
         return gtsam.Pose3(gtsam.Rot3.RzRyRx(roll, pitch, yaw), np.array((x, y, z)))
+
+    def seven(self, pose: Pose) -> tuple[float, ...]:
+        q = pose.rotation().toQuaternion()
+        return (*pose.translation().tolist(), q.x(), q.y(), q.z(), q.w())
 
     def numbers(self, pose: Pose) -> tuple[float, ...]:
         matrix = pose.matrix()
@@ -291,6 +311,12 @@ class Spatial:
 
     def estimate_point(self, solver: Any, key: int) -> Array:
         return np.asarray(solver.calculateEstimatePoint3(key))
+
+    def pose_in(self, values: gtsam.Values, key: int) -> Pose:
+        return values.atPose3(key)
+
+    def point_in(self, values: gtsam.Values, key: int) -> Array:
+        return np.asarray(values.atPoint3(key))
 
     def sevens(self, values: gtsam.Values, keys: Sequence[int]) -> Array:
         if not keys:

@@ -1,15 +1,15 @@
 """Landmarks with known ids, seen from the robot: position, bearing and range, bearing alone."""
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
 
 from ..config import LandmarkSource
-from ..context import Context, defaulted, refuse
+from ..context import Context, Unusable, defaulted, each
 from ..errors import BadMessage
-from ..graph import UNTIL_JOINED, Decision, Delta, Factor, Keyframe, Motion, Offer, Pose, Wait
+from ..graph import UNTIL_JOINED, Delta, Factor, Keyframe, Motion, Offer, Pose, Wait
 from ..keyframes import Placed
 from ..measurement import Array, Decoder, Measurement, Message, frozen, parse_frame, stamp_of
 from ..robust.kernels import noise_of
@@ -105,32 +105,16 @@ def factors(
     There is no native factor for a position in the frame of a pose: a position is turned into bearing and
     range with its covariance to first order, which is exact enough while sigma is small beside the range.
     """
-    found: list[Factor] = []
     points: dict[int, Array] = {}
-    waits: list[Wait] = []
-    decisions: list[Decision] = []
-    for offer in window:
-        made = _sight(offer, context, config, points)
-        if isinstance(made, Factor):
-            found.append(made)
-        elif isinstance(made, Wait):
-            waits.append(made)
-        else:
-            decisions.append(refuse(offer, "landmark", *made))
-    return Delta(tuple(found), values=points, waits=tuple(waits), decisions=tuple(decisions))
+    delta = each(window, "landmark", lambda offer: _sight(offer, context, config, points))
+    return replace(delta, values=points)
 
 
-def _sight(
-    offer: Offer, context: Context, config: LandmarkSource, points: dict[int, Array]
-) -> Factor | Wait | tuple[str, str]:
+def _sight(offer: Offer, context: Context, config: LandmarkSource, points: dict[int, Array]) -> Factor | Wait:
     """One sighting; a landmark that it makes is added to `points`."""
     m = offer.measurement
     assert isinstance(m, LandmarkObservation)
-    placed, mount = context.place(m.stamp), context.mount(m.frame)
-    if placed is None:
-        return "uncovered", "no trajectory at its stamp"
-    if mount is None:
-        return "unknown_frame", f"no extrinsics for '{m.frame}': add them to the config"
+    placed, mount = context.landing(m.stamp), context.mount(m.frame)
     key, pose_key, space = context.landmark(m.landmark), placed.keyframe.pose, context.space
     known = key in points or context.component(key) is not None
     if key not in points and known and context.component(key) != context.component(pose_key):
@@ -142,20 +126,17 @@ def _sight(
         if not known:
             return Wait(offer, key, "a bearing alone cannot place a landmark")
         return _bearing(offer, placed, mount, (value, covariance), context, config, points)
-    polar = _polar(m.form, (value, covariance), mount, placed.motion, space)
-    if polar is None:
-        return "range", "the landmark is where the robot is"
-    value, noise, point = polar
+    value, noise, point = _polar(m.form, (value, covariance), mount, placed.motion, space)
     if not known:
         points[key] = context.pose(pose_key).transformFrom(point)
     factor = space.observe(pose_key, key, value, noise_of(noise, config))
-    return Factor(offer.id, "landmark", factor, (pose_key, key))
+    return Factor(offer.id, "landmark", factor, (pose_key, key), offer.measurement.stamp)
 
 
 def _polar(
     form: Form, seen: tuple[Array, Array], mount: Pose, motion: Motion | None, space: Space
-) -> tuple[Array, Array, Array] | None:
-    """Value and covariance for the native factor, and the point, from the keyframe; None at zero distance."""
+) -> tuple[Array, Array, Array]:
+    """Value and covariance for the native factor, and the point, all from the keyframe."""
     value, covariance = seen
     if form == "bearing_range":
         if mount is space.identity and motion is None:
@@ -164,7 +145,7 @@ def _polar(
         value, covariance = space.to_cartesian(value, covariance)
     point, covariance = moved(value, covariance, mount, motion)
     if not np.any(point):
-        return None
+        raise Unusable("range", "the landmark is where the robot is")
     return (*space.to_polar(point, covariance), point)
 
 
@@ -174,6 +155,7 @@ def _bearing(
     mount: Pose,
     seen: tuple[Array, Array],
     context: Context,
+    config: LandmarkSource,
     points: dict[int, Array],
 ) -> Factor:
     """A bearing of a landmark that has a position. From beside the keyframe it is carried over at the landmark's
@@ -186,12 +168,12 @@ def _bearing(
     noise = space.bearing_noise(value, covariance)
     if mount is not space.identity or placed.motion is not None:
         sensor = placed.motion.pose.compose(mount) if placed.motion else mount
-        point = points[key] if key in points else context.estimate.point(key)
+        point = points[key] if key in points else context.point(key)
         distance = float(np.linalg.norm(context.pose(pose_key).compose(sensor).transformTo(point)))
         carried = sensor.transformFrom(space.direction(value[0], value[1]) * max(distance, 1e-3))
         value = space.angles(carried)
     factor = space.observe_bearing(pose_key, key, value, noise_of(noise, config))
-    return Factor(offer.id, "landmark", factor, (pose_key, key))
+    return Factor(offer.id, "landmark", factor, (pose_key, key), offer.measurement.stamp)
 
 
 def moved(point: Array, covariance: Array, mount: Pose, motion: Motion | None) -> tuple[Array, Array]:

@@ -87,4 +87,4 @@ def factors(
     guess = context.pose(a.pose).compose(motion.pose)
     factor = context.space.between(a.pose, b.pose, motion.pose, noise_of(motion.covariance))
     name = f"{window[-1].measurement.source}/{format_stamp(b.stamp)}/0"
-    return Delta((Factor(name, "motion", factor, (a.pose, b.pose)),), values={b.pose: guess})
+    return Delta((Factor(name, "motion", factor, (a.pose, b.pose), b.stamp),), values={b.pose: guess})

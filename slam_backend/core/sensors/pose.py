@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..config import PoseSource
-from ..context import Context, defaulted, refuse
+from ..context import Context, defaulted, each
 from ..graph import Delta, Factor, Keyframe, Motion, Offer
 from ..measurement import Array, Decoder, Measurement, Message, frozen, seven_of, stamp_of
 from ..robust.kernels import noise_of
@@ -39,30 +39,19 @@ def factors(
     config: PoseSource,
 ) -> Delta:
     """A prior on the nearest keyframe, seen through the motion since."""
-    found: list[Factor] = []
-    decisions = []
-    space = context.space
+    return each(window, "pose", lambda offer: _factor(offer, context, config))
+
+
+def _factor(offer: Offer, context: Context, config: PoseSource) -> Factor:
+    m, space = offer.measurement, context.space
+    assert isinstance(m, AbsolutePose)
+    placed, mount = context.landing(m.stamp), context.mount(m.frame)
+    pose = space.pose(m.pose.tolist())
     default = space.diagonal(config.sigma_rotation**2, config.sigma_translation**2)
-    for offer in window:
-        m = offer.measurement
-        assert isinstance(m, AbsolutePose)
-        placed, mount = context.place(m.stamp), context.mount(m.frame)
-        if placed is None:
-            decisions.append(refuse(offer, "pose", "uncovered", "no trajectory at its stamp"))
-            continue
-        if mount is None:
-            decisions.append(
-                refuse(
-                    offer, "pose", "unknown_frame", f"no extrinsics for '{m.frame}': add them to the config"
-                )
-            )
-            continue
-        pose = space.pose(m.pose.tolist())
-        absolute = Motion(pose, defaulted(space.covariance(m.covariance, pose), default))
-        absolute = absolute.then(Motion(mount.inverse(), np.zeros_like(default)))
-        if placed.motion is not None:
-            absolute = absolute.then(placed.motion.inverse())
-        key = placed.keyframe.pose
-        prior = space.prior(key, absolute.pose, noise_of(absolute.covariance, config))
-        found.append(Factor(offer.id, "pose", prior, (key,)))
-    return Delta(tuple(found), decisions=tuple(decisions))
+    absolute = Motion(pose, defaulted(space.covariance(m.covariance, pose), default))
+    absolute = absolute.then(Motion(mount.inverse(), np.zeros_like(default)))
+    if placed.motion is not None:
+        absolute = absolute.then(placed.motion.inverse())
+    key = placed.keyframe.pose
+    prior = space.prior(key, absolute.pose, noise_of(absolute.covariance, config))
+    return Factor(offer.id, "pose", prior, (key,), m.stamp)

@@ -7,7 +7,7 @@ import gtsam
 import numpy as np
 
 from ..config import RelativeSource
-from ..context import Context, defaulted, refuse
+from ..context import Context, Unusable, defaulted, each
 from ..errors import BadMessage
 from ..graph import Delta, Factor, Keyframe, Motion, Offer, Pose
 from ..measurement import (
@@ -112,31 +112,16 @@ def factors(
     config: RelativeSource,
 ) -> Delta:
     """A between factor per measurement; both ends land at the nearest keyframes, at their own stamps."""
-    found: list[Factor] = []
-    decisions = []
-    for offer in window:
-        made = _factor(offer, context, config)
-        if isinstance(made, Factor):
-            found.append(made)
-        else:
-            decisions.append(refuse(offer, "relative", *made))
-    return Delta(tuple(found), decisions=tuple(decisions))
+    return each(window, "relative", lambda offer: _factor(offer, context, config))
 
 
-def _factor(offer: Offer, context: Context, config: RelativeSource) -> Factor | tuple[str, str]:
+def _factor(offer: Offer, context: Context, config: RelativeSource) -> Factor:
     m = offer.measurement
     assert isinstance(m, RelativePose)
-    a, b = context.place(m.stamp_i), context.place(m.stamp_j)
-    if a is None or b is None:
-        return "uncovered", "no trajectory at one of its stamps"
+    a, b = context.landing(m.stamp_i), context.landing(m.stamp_j)
     if a.keyframe is b.keyframe:
-        return "one_keyframe", "both ends land at the same keyframe"
+        raise Unusable("one_keyframe", "both ends land at the same keyframe")
     mount_i, mount_j = context.mount(m.frame_i), context.mount(m.frame_j)
-    if mount_i is None or mount_j is None:
-        return (
-            "unknown_frame",
-            f"no extrinsics for '{m.frame_i if mount_i is None else m.frame_j}': add them to the config",
-        )
     space = context.space
     pose = space.pose(m.pose.tolist())
     if (
@@ -153,7 +138,7 @@ def _factor(offer: Offer, context: Context, config: RelativeSource) -> Factor | 
         pose, noise = moved.pose, noise_of(moved.covariance, config)
     keys = (a.keyframe.pose, b.keyframe.pose)
     kind = "motion" if offer.motion else "loop"
-    return Factor(offer.id, kind, space.between(*keys, pose, noise), keys, (m.stamp_i, m.stamp_j))
+    return Factor(offer.id, kind, space.between(*keys, pose, noise), keys, m.stamp, m.ends)
 
 
 def _measured(m: RelativePose, pose: Pose, context: Context, config: RelativeSource) -> Motion:
@@ -174,9 +159,7 @@ def _shifted(measured: Motion, mount_i: Pose, mount_j: Pose) -> Motion:
     return Motion(mount_i, exact).then(measured).then(Motion(mount_j.inverse(), exact))
 
 
-def step(m: RelativePose, context: Context) -> Pose | None:
-    """`base_i_T_base_j` as measured; None when a frame is unknown."""
+def step(m: RelativePose, context: Context) -> Pose:
+    """`base_i_T_base_j` as measured; Unusable when a frame is unknown."""
     mount_i, mount_j = context.mount(m.frame_i), context.mount(m.frame_j)
-    if mount_i is None or mount_j is None:
-        return None
     return mount_i.compose(context.space.pose(m.pose.tolist())).compose(mount_j.inverse())

@@ -10,7 +10,10 @@ from . import isam2
 
 
 class Solver(Protocol):
-    factors: Mapping[str, Factor]  # the store: what is in the graph now
+    @property
+    def factors(self) -> Mapping[str, Factor]:
+        """The store: what is in the graph now, by id."""
+        ...
 
     def update(self, delta: Delta) -> Estimate:
         """Apply a change whole; SolverFailure, with nothing applied, names the factors that cannot be solved."""

@@ -1,0 +1,160 @@
+"""The way of a change: into the solver, whole; without what cannot be solved; with the parts that it connects."""
+
+from collections.abc import Callable, Collection
+from typing import Any
+
+from .errors import SolverFailure
+from .graph import UNTIL_JOINED, Decision, Delta, Estimate, Factor, Pose, is_pose
+from .parts import Parts
+from .solvers import Solver
+from .space import Space
+
+FOUNDATION = frozenset({"gauge", "motion"})  # kinds without which a keyframe cannot be
+
+
+class Applier:
+    """Gives changes to the solver and keeps the books: decisions, parts, and who waits for which variable.
+
+    A measurement that connects something is a change of its own: the first absolute pose of a part moves the part
+    there and replaces its gauge; a relative pose between two parts moves the later one to where it says. Both are
+    sets of first guesses for variables that exist, so that the solver starts near the answer.
+    """
+
+    def __init__(self, solver: Solver, space: Space, parts: Parts, wake: Callable[[int], None]) -> None:
+        """wake: called with the key of each new landmark, and with UNTIL_JOINED when two parts become one."""
+        self._solver, self._space, self._parts, self._wake = solver, space, parts, wake
+        self.estimate: Estimate | None = None
+        self.decisions: list[Decision] = []
+
+    def take_decisions(self) -> list[Decision]:
+        taken, self.decisions = self.decisions, []
+        return taken
+
+    def apply(self, delta: Delta) -> None:
+        """SolverFailure when not even the motion can be solved; nothing of the change is in the graph then."""
+        while (event := next((f for f in delta.add if self._connects(f)), None)) is not None:
+            before, delta = _split(delta, event)
+            self._solve(before)
+            self._connect(event)
+        self._solve(delta)
+
+    def _connects(self, factor: Factor) -> bool:
+        if factor.kind == "pose":
+            part = self._parts.of(factor.keys[0])
+            return part is not None and self._parts.gauge(part) is not None
+        return len(factor.keys) == 2 and len(self._parts_of(factor)) == 2
+
+    def _parts_of(self, factor: Factor) -> set[int]:
+        return {part for key in factor.keys if (part := self._parts.of(key)) is not None}
+
+    def _connect(self, event: Factor) -> None:
+        loose = [part for part in self._parts_of(event) if self._parts.gauge(part) is not None]
+        delta = Delta((event,))
+        if loose:
+            part = max(loose)
+            gauge = self._parts.gauge(part)
+            assert gauge is not None
+            delta = Delta((event,), (gauge,), self._moved(part, event))
+        if not self._solve(delta):
+            return
+        if event.kind == "pose":
+            self._parts.release(part)
+            return
+        kept, gone = sorted(self._parts_of(event))
+        if loose and part == kept:  # the earlier part was moved onto one with absolute measurements
+            self._parts.release(kept)
+        self._parts.merge(kept, gone)
+        self._wake(UNTIL_JOINED)
+
+    def _moved(self, part: int, event: Factor) -> dict[int, Any]:
+        """The variables of a part, moved as a whole so that the event's error is zero."""
+        assert self.estimate is not None
+        pose = self.estimate.pose
+        shift: Pose
+        if event.kind == "pose":
+            shift = event.factor.prior().compose(pose(event.keys[0]).inverse())
+        else:
+            a, b = event.keys
+            there = pose(a).compose(event.factor.measured())
+            shift = there.compose(pose(b).inverse())
+            if self._parts.of(b) != part:
+                shift = shift.inverse()
+        values, space = self.estimate.values(), self._space
+        return {
+            key: shift.compose(space.pose_in(values, key))
+            if is_pose(key)
+            else shift.transformFrom(space.point_in(values, key))
+            for key in self._parts.members(part)
+        }
+
+    def _solve(self, delta: Delta) -> bool:
+        """Whether the change was applied whole; factors that cannot be solved are left out with a decision."""
+        whole = True
+        while delta:
+            try:
+                self.estimate = self._solver.update(delta)
+            except SolverFailure as failure:
+                bad = [factor for factor in delta.add if factor.id in failure.guilty]
+                self.decisions += [_unsolvable(factor, failure) for factor in bad]
+                if not bad or any(factor.kind in FOUNDATION for factor in bad):
+                    raise
+                delta, whole = without(delta, failure.guilty), False
+                if not delta.add:
+                    return False
+                continue
+            finally:
+                self.decisions += self._solver.incidents()
+            self._book(delta)
+            return whole
+        return whole
+
+    def _book(self, delta: Delta) -> None:
+        for factor in delta.add:
+            fresh = [key for key in factor.keys if self._parts.of(key) is None]
+            for key in fresh:
+                self._parts.put(key, factor.keys[0])
+                self._wake(key)
+            if factor.kind in ("loop", "pose"):
+                self.decisions.append(_accepted(factor))
+
+
+def without(delta: Delta, ids: Collection[str]) -> Delta:
+    """The change without some factors, and without the new variables that only they touched."""
+    if not ids:
+        return delta
+    add = tuple(factor for factor in delta.add if factor.id not in ids)
+    dropped = {key for factor in delta.add if factor.id in ids for key in factor.keys}
+    kept = {key for factor in add for key in factor.keys}
+    values = {key: value for key, value in delta.values.items() if key in kept or key not in dropped}
+    return Delta(add, delta.remove, values, delta.waits, delta.decisions)
+
+
+def _split(delta: Delta, event: Factor) -> tuple[Delta, Delta]:
+    """What must be in the graph before the event, and what can follow it; the event itself is in neither."""
+    at = delta.add.index(event)
+    before = tuple(f for n, f in enumerate(delta.add) if n < at or (f.kind in FOUNDATION and n != at))
+    after = tuple(f for f in delta.add[at + 1 :] if f.kind not in FOUNDATION)
+    touched = {key for factor in (*before, event) for key in factor.keys}
+    early = {key: value for key, value in delta.values.items() if key in touched}
+    late = {key: value for key, value in delta.values.items() if key not in touched}
+    return Delta(before, delta.remove, early), Delta(after, (), late)
+
+
+def _accepted(factor: Factor) -> Decision:
+    return Decision(
+        factor.stamp, factor.id, factor.source, "accepted", "admit", "unjudged", "no robust stage judges it",
+        ends=factor.stamps,
+    )  # fmt: skip
+
+
+def _unsolvable(factor: Factor, failure: SolverFailure) -> Decision:
+    return Decision(
+        factor.stamp,
+        factor.id,
+        factor.source,
+        "refused",
+        "solver",
+        "unsolvable",
+        str(failure),
+        ends=factor.stamps,
+    )

@@ -1,0 +1,397 @@
+"""The back-end: measurements in, small updates out, snapshots when asked. No clock, no file, no thread, no ROS."""
+
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from heapq import heappop, heappush
+from typing import Any
+
+import gtsam
+import numpy as np
+
+from .apply import Applier, without
+from .config import Config, OdometrySource
+from .context import Context, Unusable
+from .errors import BadConfig, SlamError, SolverFailure
+from .graph import (
+    Decision,
+    Delta,
+    Estimate,
+    Factor,
+    Keyframe,
+    Offer,
+    Pose,
+    Wait,
+    identify,
+    keyframe,
+    landmark_key,
+    total,
+)
+from .keyframes import Timeline, Track, due
+from .measurement import Array, Measurement, StaticTransform, format_stamp
+from .mounts import Mounts
+from .parts import Parts
+from .robust import Robust
+from .robust.kernels import noise_of
+from .sensors import SENSORS, relative
+from .sensors.odometry import OdometryPose
+from .sensors.relative import RelativePose
+from .solvers import SOLVERS, Solver
+from .space import SPACES
+from .trajectory import Snapshot, Trajectory
+
+GAUGE_SIGMA = 1e-3  # m and rad; of the prior that fixes a part of the graph in space
+NOTICEABLE = (1e-3, 1e-4)  # m, rad: a correction of the newest pose that counts as a revision
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Update:
+    """What one keyframe changed; plain data, small enough to send each time.
+
+    pose: `map_T_base` of the keyframe; correction: `map_T_odom`; both x y z qx qy qz qw.
+    revision: grows whenever a solver update corrects the newest pose noticeably.
+    """
+
+    keyframe: Keyframe
+    pose: tuple[float, ...]
+    correction: tuple[float, ...]
+    revision: int
+    decisions: tuple[Decision, ...]
+
+
+class Backend:
+    """The core of live node and replay alike. Measurements must come in settled order (see `settle`)."""
+
+    def __init__(
+        self, config: Config | None = None, solver: Solver | None = None, robust: Sequence[Robust] = ()
+    ) -> None:
+        self.config = config = config or Config(sources={"odometry": OdometrySource()})
+        self.space = space = SPACES[config.space]
+        self.solver = solver or SOLVERS["isam2"](config, space)
+        self._robust = robust
+        self._driver = config.driver
+        if self._driver is None:
+            raise BadConfig("no source drives the keyframes: add one of kind odometry or relative")
+        driving = config.sources[self._driver]
+        self._relative = driving.kind == "relative"
+        self.track = Track(space, driving if isinstance(driving, OdometrySource) else OdometrySource())
+        self.timeline = Timeline()
+        self.parts = Parts()
+        self._mounts = Mounts(space, config.base_frame, config.extrinsics)
+        self._landmarks: dict[str, int] = {}
+        self._pending: list[Offer] = []
+        self._asked: list[int] = []  # stamps at which a source wants a keyframe
+        self._waiting: dict[int, list[Wait]] = defaultdict(list)
+        self._counts: dict[str, dict[int, int]] = defaultdict(dict)
+        self._decisions: list[Decision] = []  # told with the next update
+        self._newest: tuple[Keyframe, Pose] | None = None  # and its odometry pose
+        self._applier = Applier(self.solver, space, self.parts, self._wake)
+        self._revision = 0
+
+    def add(self, measurement: Measurement) -> list[Update]:
+        """Take the next measurement; return an update for each keyframe that it made."""
+        if isinstance(measurement, StaticTransform):
+            self._mounts.add(measurement)
+            return []
+        if isinstance(measurement, OdometryPose) and measurement.source == self._driver:
+            return self._drive(measurement)
+        updates = []
+        if self._relative and self._pending and measurement.stamp > self._pending[-1].measurement.stamp:
+            updates = self._close()
+        self._offer(measurement)
+        return updates
+
+    def finish(self) -> list[Update]:
+        """The input has ended: land what still waits, then linearize everything anew."""
+        updates: list[Update] = []
+        if self._relative:
+            updates += self._close()
+        elif self._newest and self.track.newest > self._newest[0].stamp:
+            updates += self._extend(self.track.newest)
+        while self._newest and self._pending:
+            if not (window := self._window(self._newest[0].stamp)):
+                break
+            updates += self._update(self._newest[0], self._factors(window, None, self._newest[0], {}), ())
+        self._refuse_leftovers()
+        if self._newest:
+            self._applier.estimate = self.solver.polish()
+        if self._newest and self._decisions:
+            updates.append(self._told(self._newest[0]))
+        return updates
+
+    @property
+    def estimate(self) -> Estimate:
+        """What the solver believes now. SlamError before the first keyframe."""
+        if self._applier.estimate is None:
+            raise SlamError("there is no keyframe yet: no message of the driving source has been accepted")
+        return self._applier.estimate
+
+    def snapshot(self) -> Snapshot:
+        """Everything believed now; costs time in proportion to the graph."""
+        keyframes = self.timeline.in_order()
+        stamps = np.array([k.stamp for k in keyframes], dtype=np.int64)
+        names = tuple(name for name, key in self._landmarks.items() if self.parts.of(key) is not None)
+        values = self._applier.estimate.values() if self._applier.estimate else gtsam.Values()
+        sevens = self.space.sevens(values, [k.pose for k in keyframes])
+        odometry = np.array([self.space.seven(self.track.pose(k.stamp)) for k in keyframes]).reshape(-1, 7)
+        points = np.zeros((len(names), 3))
+        for row, name in zip(points, names, strict=True):
+            row[: self.space.point_dimension] = self.space.point_in(values, self._landmarks[name])
+        drifted = Trajectory(stamps, odometry)
+        return Snapshot(
+            Trajectory(stamps, sevens),
+            np.array([k.index for k in keyframes], dtype=np.int64),
+            drifted.from_start(sevens[0]) if len(keyframes) else drifted,
+            names,
+            points,
+            self._revision,
+        )
+
+    # -- the way of a measurement ----------------------------------------------------------------
+
+    def _offer(self, measurement: Measurement) -> None:
+        counts = self._counts[measurement.source]
+        n = counts[measurement.stamp] = counts.get(measurement.stamp, -1) + 1
+        self._pending.append(Offer(identify(measurement, n), measurement))
+        if getattr(self.config.sources[measurement.source], "keyframe", False):
+            for stamp in measurement.ends or (measurement.stamp,):
+                heappush(self._asked, stamp)
+
+    def _drive(self, odometry: OdometryPose) -> list[Update]:
+        """The driving odometry moves on: keyframes that were asked for, then one of its own if it is due."""
+        self._mounts.name_base(odometry.child)
+        pose = self.space.pose(odometry.pose.tolist())
+        self.track.add(odometry.stamp, pose, self._odometry_noise(odometry, pose))
+        updates: list[Update] = []
+        while self._asked and self._asked[0] <= odometry.stamp:
+            stamp = heappop(self._asked)
+            if self.track.covers(stamp) and (self._newest is None or stamp > self._newest[0].stamp):
+                updates += self._extend(stamp)
+        if self._newest is None:
+            return updates + self._extend(odometry.stamp)
+        newest, there = self._newest
+        if odometry.stamp > newest.stamp and due(
+            self.config.keyframes, self.space, there.between(pose), odometry.stamp - newest.stamp
+        ):
+            updates += self._extend(odometry.stamp)
+        return updates
+
+    def _odometry_noise(self, odometry: OdometryPose, pose: Pose) -> Array | None:
+        """What the track's noise mode needs of a message: of its step, of its pose, or nothing."""
+        source = self.config.sources[odometry.source]
+        assert isinstance(source, OdometrySource)
+        if source.noise == "pose":
+            return self.space.covariance(odometry.covariance, pose)
+        if source.noise == "twist":
+            elapsed = (odometry.stamp - self.track.newest) / 1e9 if len(self.track) else 0.0
+            return self.space.twist_covariance(odometry.twist_covariance) * elapsed**2
+        return None
+
+    def _extend(self, stamp: int) -> list[Update]:
+        """A new keyframe at a stamp that the odometry covers, with everything that lands there."""
+        a = self._newest[0] if self._newest else None
+        b = keyframe(len(self.timeline), stamp)
+        self.timeline.add(b)
+        if a is None:
+            delta = self._gauge(b)
+        else:
+            self.parts.put(b.pose, a.pose)
+            here = self._context({})
+            odometry = [Offer("", Measurement(stamp, str(self._driver)))]
+            delta = SENSORS["odometry"].factors(odometry, a, b, here, self.config.sources[str(self._driver)])
+        self._newest = (b, self.track.pose(stamp))
+        self.track.protect()
+        return self._update(b, delta + self._factors(self._window(stamp), a, b, delta.values), [b])
+
+    def _close(self) -> list[Update]:
+        """Without odometry: the measurements of one stamp are complete; their edges make the keyframes."""
+        window, self._pending = self._pending, []
+        if not window:
+            return []
+        before = len(self.timeline)
+        a = self._newest[0] if self._newest else None
+        growth, window = self._grow(window)
+        new = self.timeline.keyframes[before:]
+        b = max(new, key=lambda k: k.stamp, default=a)
+        if b is None:
+            self._decisions += growth.decisions
+            return []
+        if a is None or b.stamp > a.stamp:
+            self._newest = (b, self.track.pose(b.stamp))
+        return self._update(b, growth + self._factors(window, a, b, growth.values), new)
+
+    def _grow(self, window: Sequence[Offer]) -> tuple[Delta, list[Offer]]:
+        """New keyframes along the driving source's edges, each from an end that is known; a part of its own where
+        neither end is. Returns first guesses and gauges, and the window with the edges that made keyframes marked.
+        """
+        grown: list[Delta] = []
+        guesses: dict[int, Any] = {}
+        edges = [offer for offer in window if offer.measurement.source == self._driver]
+        rest = [offer for offer in window if offer.measurement.source != self._driver]
+        while edges:
+            at = self.timeline.at
+            n = next(
+                (n for n, (_, m, _) in enumerate(edges) if any(at(stamp) for stamp in m.ends or ())), None
+            )
+            offer = edges.pop(n or 0)
+            m = offer.measurement
+            assert isinstance(m, RelativePose)
+            try:
+                step = relative.step(m, self._context(guesses))
+            except Unusable as why:
+                grown.append(Delta(decisions=(_refusal(offer, "relative", why.reason, why.detail),)))
+                continue
+            if n is None:
+                start = self._begin(m.stamp_i)
+                grown.append(start)
+                guesses.update(start.values)
+            i, j = at(m.stamp_i), at(m.stamp_j)
+            if i is not None and j is None:
+                guesses.update(self._branch(i, m.stamp_j, step, guesses))
+            elif j is not None and i is None:
+                guesses.update(self._branch(j, m.stamp_i, step.inverse(), guesses))
+            rest.append(offer._replace(motion=i is None or j is None))
+        return total(grown) + Delta(values=guesses), rest
+
+    def _begin(self, stamp: int) -> Delta:
+        first = keyframe(len(self.timeline), stamp)
+        self.timeline.add(first)
+        self.track.add(stamp, self.space.identity)
+        return self._gauge(first)
+
+    def _branch(self, known: Keyframe, stamp: int, step: Pose, guesses: Mapping[int, Any]) -> dict[int, Any]:
+        new = keyframe(len(self.timeline), stamp)
+        pose = guesses[known.pose] if known.pose in guesses else self.estimate.pose(known.pose)
+        self.timeline.add(new)
+        self.parts.put(new.pose, known.pose)
+        self.track.add(stamp, self.track.pose(known.stamp).compose(step))
+        return {new.pose: pose.compose(step)}
+
+    def _gauge(self, first: Keyframe) -> Delta:
+        """Begin a part of the graph: its first pose is the origin, until something absolute says otherwise."""
+        name = f"gauge/{format_stamp(first.stamp)}/0"
+        self.parts.begin(first.pose, name)
+        noise = noise_of(self.space.diagonal(GAUGE_SIGMA**2, GAUGE_SIGMA**2))
+        prior = self.space.prior(first.pose, self.space.identity, noise)
+        factor = Factor(name, "gauge", prior, (first.pose,), first.stamp)
+        return Delta((factor,), values={first.pose: self.space.identity})
+
+    def _window(self, until: int) -> list[Offer]:
+        """Take what waits for a keyframe at this stamp, late measurements included."""
+        window = [offer for offer in self._pending if offer.measurement.stamp <= until]
+        self._pending = [offer for offer in self._pending if offer.measurement.stamp > until]
+        return window
+
+    def _factors(
+        self, window: Sequence[Offer], a: Keyframe | None, b: Keyframe, guesses: Mapping[int, Any]
+    ) -> Delta:
+        """Ask each sensor, in the order of the configuration, for the factors of its part of the window."""
+        if not window:
+            return Delta()
+        context = self._context(guesses)
+        by_source: dict[str, list[Offer]] = defaultdict(list)
+        for offer in window:
+            by_source[offer.measurement.source].append(offer)
+        return total(
+            SENSORS[source.kind].factors(by_source[name], a, b, context, source)
+            for name, source in self.config.sources.items()
+            if name in by_source
+        )
+
+    def _context(self, guesses: Mapping[int, Any]) -> Context:
+        return Context(
+            self.space,
+            self._applier.estimate,
+            guesses,
+            self._mounts,
+            lambda stamp: self.timeline.place(stamp, self.track, self.space),
+            self.track.motion,
+            self._landmark,
+            self.parts.of,
+        )
+
+    def _landmark(self, name: str) -> int:
+        return self._landmarks.setdefault(name, landmark_key(len(self._landmarks)))
+
+    # -- the way of a change ---------------------------------------------------------------------
+
+    def _update(self, b: Keyframe, delta: Delta, new: Sequence[Keyframe]) -> list[Update]:
+        """Solve: motion and all that nothing judges first, then what the robust stages let in."""
+        self._decisions += delta.decisions
+        for wait in delta.waits:
+            self._wait(wait)
+        judged = tuple(f for f in delta.add if any(f.kind in stage.kinds for stage in self._robust))
+        try:
+            self._applier.apply(without(delta, {factor.id for factor in judged}))
+            if self._robust:
+                self._judge(Delta(judged, values=delta.values))
+        except SolverFailure:
+            self._give_up(new)
+            return []
+        return [self._told(b, delta.values.get(b.pose))]
+
+    def _judge(self, proposed: Delta) -> None:
+        for stage in self._robust:
+            proposed, decisions = stage.admit(proposed, self.estimate)
+            self._decisions += decisions
+        self._applier.apply(proposed)
+        for stage in self._robust:
+            amendment, decisions = stage.review(self.estimate)
+            self._decisions += decisions
+            self._applier.apply(amendment)
+
+    def _give_up(self, new: Sequence[Keyframe]) -> None:
+        """Not even the motion could be solved: the keyframes are taken back, the next one spans the gap."""
+        estimate = self._applier.estimate
+        for gone in reversed(new):
+            if estimate is None or not estimate.knows(gone.pose):
+                self.timeline.drop(gone)
+                self.parts.drop(gone.pose)
+        last = self.timeline.newest
+        self._newest = (last, self.track.pose(last.stamp)) if last else None
+
+    def _told(self, b: Keyframe, guess: Pose | None = None) -> Update:
+        """The update for the newest keyframe, with the decisions since the last one."""
+        pose = self.estimate.pose(b.pose)
+        if guess is not None:
+            meters, radians = self.space.size(guess.between(pose))
+            self._revision += meters > NOTICEABLE[0] or radians > NOTICEABLE[1]
+        correction = pose.compose(self.track.pose(b.stamp).inverse())
+        decisions = (*self._decisions, *self._applier.take_decisions())
+        self._decisions = []
+        return Update(b, self.space.seven(pose), self.space.seven(correction), self._revision, decisions)
+
+    # -- what waits ------------------------------------------------------------------------------
+
+    def _wait(self, wait: Wait) -> None:
+        self._waiting[wait.until].append(wait)
+        m = wait.offer.measurement
+        self._decisions.append(
+            Decision(
+                m.stamp,
+                wait.offer.id,
+                m.source,
+                "probation",
+                "wait",
+                "undetermined",
+                wait.reason,
+                ends=m.ends,
+            )
+        )
+
+    def _wake(self, key: int) -> None:
+        """A variable exists now, or parts were joined: what waited for it is offered again."""
+        self._pending += [wait.offer for wait in self._waiting.pop(key, ())]
+
+    def _refuse_leftovers(self) -> None:
+        """At the end of the input: what no keyframe ever covered, and what waited in vain."""
+        for offer in self._pending:
+            self._decisions.append(_refusal(offer, "backend", "uncovered", "no trajectory at its stamp"))
+        for wait in (wait for waits in self._waiting.values() for wait in waits):
+            self._decisions.append(_refusal(wait.offer, "wait", "undetermined", wait.reason))
+        self._pending, self._waiting = [], defaultdict(list)
+
+
+def _refusal(offer: Offer, stage: str, reason: str, detail: str) -> Decision:
+    m = offer.measurement
+    return Decision(m.stamp, offer.id, m.source, "refused", stage, reason, detail, ends=m.ends)
