@@ -47,13 +47,9 @@ def lifted(covariances: Array) -> Array:
 
 
 def rows(name: str) -> list[list[str]]:
+    """The words of each line that has any. BadFile if this gtsam comes without the file."""
     try:
-        return [
-            line.split()
-            for line in Path(gtsam.findExampleDataFile(name)).read_text().splitlines()
-            if line.strip()
-        ]
+        path = Path(gtsam.findExampleDataFile(name))  # type: ignore[no-untyped-call]  # gtsam leaves it untyped
     except (FileNotFoundError, RuntimeError):
-        raise BadFile(
-            f"{name}: not found among gtsam's examples; `pip install gtsam==4.3.0` brings it"
-        ) from None
+        raise BadFile(f"{name}: not among gtsam's examples; install the wheel of gtsam 4.3") from None
+    return [line.split() for line in path.read_text().splitlines() if line.strip()]

@@ -34,7 +34,7 @@ def sphere2500() -> Content:
         root = np.zeros((6, 6))
         root[np.triu_indices(6)] = numbers[6:]
         order = [3, 4, 5, 0, 1, 2]  # x y z roll pitch yaw, to GTSAM's
-        covariance = np.linalg.inv(root.T @ root)[np.ix_(order, order)]
+        covariance = np.asarray(np.linalg.inv(root.T @ root)[np.ix_(order, order)], dtype=np.float64)
         edges.append(Edge(int(row[1]), int(row[2]), Motion(pose(*numbers[:6]), covariance)))
     steps = [row for row in rows("sphere2500_groundtruth.txt") if int(row[2]) == int(row[1]) + 1]
     true_steps = [pose(*map(float, row[3:9])).matrix() for row in steps]

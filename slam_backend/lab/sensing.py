@@ -1,6 +1,6 @@
 """What the sensors of a simulated robot say: the truth with exactly the noise that their covariances state."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -101,7 +101,7 @@ def find_loops(truth: Array, options: Options, rng: Generator) -> list[Loop]:
 
 
 def loop_messages(
-    loops: list[Loop], stamps: list[int], options: Options, space: str, rng: Generator
+    loops: Sequence[Loop], stamps: list[int], options: Options, space: str, rng: Generator
 ) -> Iterator[RelativePose]:
     """Relative poses `i_T_j`, perturbed at the tangent of j."""
     sigmas = np.repeat([options.loop_sigma_rotation, options.loop_sigma_translation], 3)

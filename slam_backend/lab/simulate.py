@@ -15,7 +15,7 @@ from ..core.config import config_from
 from ..core.errors import BadConfig
 from ..core.geometry import inverse_of, seven_of_matrix
 from ..core.measurement import SECOND, Array, Measurement, format_stamp, frozen
-from ..core.sensors.odometry import OdometryPose
+from ..core.sensors.odometry import STILL, UNKNOWN, OdometryPose
 from ..core.sensors.relative import RelativePose
 from ..io.bags import write_bag
 from ..io.cdr import encode_cloud, encode_odometry
@@ -118,7 +118,9 @@ def _mounted(extrinsics: tuple[float, ...]) -> Array:
 def _record(sent: Sent) -> Record:
     item = sent.content
     if isinstance(item, tuple):
-        columns = {"id": np.array([int(seen.landmark) for seen in item], dtype=np.uint32)}
+        columns: dict[str, NDArray[Any]] = {
+            "id": np.array([int(seen.landmark) for seen in item], dtype=np.uint32)
+        }
         values = np.stack([seen.value for seen in item])
         columns |= {axis: values[:, k] for k, axis in enumerate("xyz")}
         columns["sigma"] = np.sqrt([seen.covariance[0, 0] for seen in item])
@@ -131,7 +133,7 @@ def _record(sent: Sent) -> Record:
             f"{item.frame_i}@{format_stamp(item.stamp_i)}",
             f"{item.frame_j}@{format_stamp(item.stamp_j)}",
         )
-        noise = (item.covariance, sensing.STILL, sensing.UNKNOWN)
+        noise = (item.covariance, STILL, UNKNOWN)
     return Record(sent.topic, ODOMETRY, sent.arrival, encode_odometry(item.stamp, *frames, item.pose, *noise))
 
 
