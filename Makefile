@@ -46,5 +46,5 @@ clean:
 	@$(BIN)/python -c 'import pip' 2>/dev/null || $(PYTHON) -m venv --clear .venv
 	@echo "installing into .venv with $$($(BIN)/python --version)"
 	@$(BIN)/python -m pip install -c constraints.txt -e '.$(if $(filter base,$*),,[$*])' >.venv/pip.log 2>&1 || \
-	  { echo "make: cannot install: $$(grep -m 1 '^ERROR' .venv/pip.log || tail -n 1 .venv/pip.log) (all of it: .venv/pip.log)" >&2; exit 1; }
+	  { echo "make: cannot install: $$(grep -m 1 -o 'ERROR.*' .venv/pip.log || tail -n 1 .venv/pip.log) (all of it: .venv/pip.log)" >&2; exit 1; }
 	@touch $@

@@ -99,7 +99,8 @@ def _explain(error: BaseException, arguments: list[str]) -> tuple[str, int]:
             return _one_line(str(error)), 2
         case typer.TyperException():  # unknown verb or option, missing or malformed argument
             words = ("slam-backend", *(verb for verb in arguments[:1] if verb in VERBS), "--help")
-            return f"{_one_line(error.format_message()).rstrip('.')} (see {' '.join(words)})", 2
+            said = _one_line(error.format_message()).replace("Value error, ", "").rstrip(".")
+            return f"{said} (see {' '.join(words)})", 2
         case typer.Abort() | KeyboardInterrupt():
             return "interrupted", 130
         case OSError():  # no permission, disk full, a directory where a file should be

@@ -10,7 +10,7 @@ from .progress import progress
 
 
 def command(
-    name: Annotated[str | None, typer.Argument(help="Which one; see --list.")] = None,
+    name: Annotated[str | None, typer.Argument(metavar="NAME", help="Which one; see --list.")] = None,
     out: Annotated[Path | None, typer.Option(metavar="BAG", help="Default: NAME.mcap here.")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print what was made as JSON.")] = False,
     as_list: Annotated[bool, typer.Option("--list", help="List the data sets.")] = False,

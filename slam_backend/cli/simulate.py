@@ -11,7 +11,9 @@ if TYPE_CHECKING:
 
 
 def command(
-    scenario: Annotated[str | None, typer.Argument(help="Which world; see --list.")] = None,
+    scenario: Annotated[
+        str | None, typer.Argument(metavar="SCENARIO", help="Which world; see --list.")
+    ] = None,
     out: Annotated[Path | None, typer.Option(metavar="BAG", help="Default: SCENARIO.mcap here.")] = None,
     seed: Annotated[int, typer.Option(min=0, help="The same seed gives the same bag.")] = 0,
     settings: Annotated[

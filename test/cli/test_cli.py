@@ -147,7 +147,7 @@ def test_a_reader_that_leaves_is_no_trouble() -> None:
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs /dev/full")
 def test_a_full_disk_is_one_line() -> None:
     with Path("/dev/full").open("w") as full:
-        ran = run("dataset", "--list", "--json", capture_output=False, stdout=full, stderr=subprocess.PIPE)
+        ran = run("--help", capture_output=False, stdout=full, stderr=subprocess.PIPE)
     assert (ran.returncode, ran.stderr) == (2, "slam-backend: No space left on device\n")
 
 
@@ -214,4 +214,43 @@ def test_data_sets_can_be_listed(capsys: pytest.CaptureFixture[str]) -> None:
 def test_an_unknown_data_set_is_the_users_mistake(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     assert cli.main(["dataset", "victoria_prak", "--out", str(tmp_path / "x.mcap")]) == 2
     assert "victoria_park" in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_converted_graph_says_what_became_of_it(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    graph, out = tmp_path / "two.g2o", tmp_path / "two.toro"
+    graph.write_text("VERTEX_SE2 0 0 0 0\nVERTEX_SE2 1 1 0 0\nEDGE_SE2 0 1 1 0 0 100 0 0 100 0 400\n")
+    assert cli.main(["convert", str(graph), str(out), "--json"]) == 0
+    assert "2 vertices, 1 edges" in json.loads(capsys.readouterr().out)["done"]
+    assert out.exists()
+
+
+def test_a_simulated_drive_comes_with_its_truth_and_its_configuration(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    out = tmp_path / "drive.mcap"
+    assert (
+        cli.main(["simulate", "square", "--out", str(out), "--seed", "3", "--set", "poses=50", "--json"]) == 0
+    )
+    made = json.loads(capsys.readouterr().out)
+    assert made["messages"] >= 100
+    assert {Path(made[name]).name for name in ("bag", "truth", "config")} == {
+        path.name for path in tmp_path.iterdir()
+    }
+
+
+@pytest.mark.parametrize(
+    ("setting", "says"),
+    [
+        ("pose=3", "did you mean 'poses'?"),
+        ("poses=many", "poses needs a whole number"),
+        ("dropout", "dropout needs a number"),
+        ("dropout=7", "dropout"),
+    ],
+)
+def test_a_wrong_option_of_a_drive_is_named(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path, setting: str, says: str
+) -> None:
+    assert cli.main(["simulate", "square", "--out", str(tmp_path / "x.mcap"), "--set", setting]) == 2
+    assert says in capsys.readouterr().err
     assert list(tmp_path.iterdir()) == []
