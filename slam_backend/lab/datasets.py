@@ -24,20 +24,22 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..core.errors import BadConfig
 from ..core.geometry import covariance_to_ros, seven_of_matrix
 from ..core.measurement import SECOND, Array
 from ..core.sensors.odometry import UNKNOWN
 from ..io.bags import write_bag
-from ..io.cdr import encode_cloud, encode_odometry
+from ..io.encode import encode_cloud, encode_odometry
+from ..io.formats import tum
 from ..io.records import Record
 from . import pose_graphs
 from .gtsam_data import Content, lifted, planar, rows, symmetric
-from .simulate import CLOUD, ODOMETRY, START, beside, tum
+from .simulate import CLOUD, ODOMETRY, START, beside
 from .world import chain
 
 SCAN = SECOND // 5  # ns between the poses of Victoria Park
@@ -70,7 +72,7 @@ def make_dataset(name: str, out: Path, advance: Callable[[int], None] = lambda _
     truth = None
     if content.truth is not None:
         truth = beside(out, ".truth.tum")
-        truth.write_text(tum(*content.truth))
+        tum.write(truth, content.truth)
     seconds = (records[-1].log_time - records[0].log_time) / SECOND
     return Made(out, len(records), DATASETS[name].description, seconds, truth)
 
@@ -97,7 +99,7 @@ def _victoria_park() -> Content:
         covariances = np.zeros((len(trees), 3, 3))
         covariances[:, :2, :2] = symmetric(values[:, 2:])
         covariances[:, 2, 2] = covariances[:, 0, 0]
-        columns = {
+        columns: dict[str, NDArray[Any]] = {
             "id": np.array([row[2] for row in trees], dtype=np.uint32),
             "x": values[:, 0],
             "y": values[:, 1],

@@ -8,16 +8,17 @@ import numpy as np
 
 from ..core.errors import BadFile
 from ..core.measurement import Array
+from ..io.formats.trajectory import Trajectory
 from ..io.records import Record
 
 PLANE = np.array([3, 4, 2])  # x, y, yaw in GTSAM's tangent w, v
 
 
 class Content(NamedTuple):
-    """Records in any order; truth as stamps (ns) and (N, 7) poses where the data set tells it."""
+    """Records in any order; truth where the data set tells it."""
 
     records: list[Record]
-    truth: tuple[list[int], Array] | None = None
+    truth: Trajectory | None = None
 
 
 def pose(x: float, y: float, z: float, roll: float, pitch: float, yaw: float) -> gtsam.Pose3:

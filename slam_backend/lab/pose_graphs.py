@@ -9,7 +9,8 @@ from ..core.geometry import covariance_to_ros, seven_of_matrix
 from ..core.graph import Motion
 from ..core.measurement import SECOND, Array, format_stamp
 from ..core.sensors.odometry import STILL, UNKNOWN
-from ..io.cdr import encode_odometry
+from ..io.encode import encode_odometry
+from ..io.formats.trajectory import Trajectory
 from ..io.records import Record
 from .gtsam_data import Content, lifted, planar, pose, rows
 from .simulate import ODOMETRY, START
@@ -68,10 +69,10 @@ def _graph(edges: Iterable[Edge], truth: Array | None = None) -> Content:
     records = []
     for n, (i, j, motion) in enumerate(sorted(forward, key=lambda e: (e.j, e.i != e.j - 1, e.i))):
         ends = [START + vertex * VERTEX for vertex in (i, j)]
-        frames = (f"{BASE}@{format_stamp(end)}" for end in ends)
+        parent, child = (f"{BASE}@{format_stamp(end)}" for end in ends)
         matrix = motion.pose.matrix()
         noise = covariance_to_ros(motion.covariance, matrix[:3, :3]).reshape(36)
-        data = encode_odometry(ends[1], *frames, seven_of_matrix(matrix), noise, STILL, UNKNOWN)
+        data = encode_odometry(ends[1], parent, child, seven_of_matrix(matrix), noise, STILL, UNKNOWN)
         records.append(Record("/edges", ODOMETRY, ends[1] + 1 + n, data))
     if truth is None:
         return Content(records)
@@ -79,4 +80,4 @@ def _graph(edges: Iterable[Edge], truth: Array | None = None) -> Content:
     for stamp, seven in zip(stamps, truth, strict=True):
         data = encode_odometry(stamp, "map", BASE, seven, UNKNOWN, STILL, UNKNOWN)
         records.append(Record("/truth", ODOMETRY, stamp, data))
-    return Content(records, (stamps, truth))
+    return Content(records, Trajectory(np.array(stamps), truth))

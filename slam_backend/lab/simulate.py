@@ -18,7 +18,9 @@ from ..core.measurement import SECOND, Array, Measurement, format_stamp, frozen
 from ..core.sensors.odometry import STILL, UNKNOWN, OdometryPose
 from ..core.sensors.relative import RelativePose
 from ..io.bags import write_bag
-from ..io.cdr import encode_cloud, encode_odometry
+from ..io.encode import encode_cloud, encode_odometry
+from ..io.formats import tum
+from ..io.formats.trajectory import Trajectory
 from ..io.records import Record
 from . import sensing
 from .channel import Sent, delivered, in_order
@@ -172,13 +174,9 @@ class Written(NamedTuple):
 
 def write_simulation(simulation: Simulation, out: Path) -> Written:
     """The bag at `out` (.mcap, else a folder); beside it the truth (.truth.tum) and the configuration (.yaml)."""
-    stem = out.with_suffix("") if out.suffix == ".mcap" else out
-    written = Written(
-        out, *(stem.with_name(stem.name + end) for end in (".truth.tum", ".yaml", ".wrong.csv"))
-    )
-    assert written.wrong is not None
+    written = Written(out, beside(out, ".truth.tum"), beside(out, ".yaml"), None)
     write_bag(out, simulation.records)
-    written.truth.write_text(tum(simulation.stamps.tolist(), simulation.sevens))
+    tum.write(written.truth, Trajectory(simulation.stamps, simulation.sevens))
     head = f"# {simulation.scenario}, seed {simulation.seed}: replays {out.name} with the noise it was made with.\n"
     text = yaml.safe_dump(dict(simulation.settings), sort_keys=False, default_flow_style=None, width=100)
     written.config.write_text(head + text)
@@ -195,9 +193,3 @@ def beside(bag: Path, ending: str) -> Path:
     """`drive.mcap` and `.yaml` to `drive.yaml`; a folder's whole name is kept."""
     name = bag.stem if bag.suffix == ".mcap" else bag.name
     return bag.with_name(name + ending)
-
-
-def tum(stamps: list[int], sevens: Array) -> str:
-    """`stamp x y z qx qy qz qw` per line: the stamp with all nanoseconds, numbers that read back exactly."""
-    rows = zip(stamps, sevens.tolist(), strict=True)
-    return "".join(f"{format_stamp(stamp)} {' '.join(map(repr, seven))}\n" for stamp, seven in rows)
