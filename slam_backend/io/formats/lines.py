@@ -157,11 +157,11 @@ def exact(values: Array) -> list[str]:
 
 def parse_seconds(text: str) -> int:
     """Decimal seconds (`12.5`, `1.3e9`, `-0.25`) to nanoseconds, digits past the ninth rounded. ValueError if it is none."""
-    whole, _, fraction = text.partition(".")
-    if len(whole) <= 10 and len(fraction) <= 9 and text.isascii() and whole.isdigit():
+    whole, dot, fraction = text.partition(".")
+    if len(whole) <= 9 + whole.startswith("1") and len(fraction) <= 9 and text.isascii() and whole.isdigit():
         if fraction.isdigit():
             return int(whole) * SECOND + int(fraction.ljust(9, "0"))
-        if text == whole:
+        if not dot:
             return int(whole) * SECOND
     return _parse_decimal(text, SECOND)
 

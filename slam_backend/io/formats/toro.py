@@ -1,17 +1,20 @@
 """TORO text files (http://openslam.org/toro.html): VERTEX2 and EDGE2, VERTEX3 and EDGE3 (roll pitch yaw).
 
-TORO's planar information stands in the order xx xy yy tt xt yt. Files of other programs under the same tags have it row
-by row (xx xy xt yy yt tt); they are told apart by the third number, which TORO's own never have at zero or below and
-such files have wherever x and theta are not correlated. The 3-D information stands row by row, translation first.
+TORO's planar information stands in the order xx xy yy tt xt yt, and along the axes of the edge's *first* vertex: it is
+turned to the second's, where everybody else has it. (Proof: CSAIL's TORO file and its g2o file then agree to 1e-9.)
+Files of other programs under the same tags have it row by row (xx xy xt yy yt tt) and as g2o means it; they are told apart by
+the third number, which TORO's own never have at zero or below and such files have wherever x and theta are not correlated.
+The 3-D information stands row by row, translation first, and is taken as that of the second vertex.
 """
 
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from ...core.geometry import rotation_of
-from ...core.measurement import Array
+from ...core.measurement import Array, frozen
 from .assemble import assemble
 from .blocks import Block, Blocks, Line, Table, read_blocks, tags_of, write_block, written_ids
 from .lines import by_tag, read_rows, write_lines
@@ -39,12 +42,19 @@ def read(path: Path) -> PoseGraph:
         notes = (*notes, "the edges state no information: taken as the identity")
     if space == "2d" and _row_by_row(blocks):
         blocks["edge"] = blocks["edge"]._replace(line=Line("EDGE2", 2, 3, SE2))
-        notes = (*notes, "information in the order xx xy xt yy yt tt, not TORO's own")
-    return assemble(space, blocks, notes)
+        return assemble(space, blocks, (*notes, "information in the order xx xy xt yy yt tt, not TORO's own"))
+    graph = assemble(space, blocks, notes)
+    if space == "3d" or not len(graph.edges):
+        return graph
+    information = frozen(_turned(graph.edges.information, graph.edges.states[:, 2]))
+    return replace(graph, edges=replace(graph.edges, information=information))
 
 
 def write(path: Path, graph: PoseGraph) -> tuple[str, ...]:
-    """The graph as TORO: to the bit in 2-D, in 3-D through roll, pitch and yaw. What it cannot say is returned in words."""
+    """The graph as TORO; what it cannot say is returned in words.
+
+    To the bit in 2-D, except information that has to be turned (1e-15); in 3-D through roll, pitch and yaw.
+    """
     write_lines(path, _lines(path, graph))
     parts = (
         ("landmarks", graph.landmarks), ("sightings", graph.sightings), ("ranges", graph.ranges),
@@ -60,7 +70,9 @@ def _lines(path: Path, graph: PoseGraph) -> Iterator[str]:
         yield from write_block(path, table["vertex"], [written_ids(graph.ids)], _stated(graph, graph.states))
     if len(edges):
         ends = [written_ids(graph.ids, edges.i), written_ids(graph.ids, edges.j)]
-        noise = fold(edges.information, table["edge"].noise)
+        planar = graph.space == "2d"
+        information = _turned(edges.information, -edges.states[:, 2]) if planar else edges.information
+        noise = fold(information, table["edge"].noise)
         yield from write_block(path, table["edge"], ends, _stated(graph, edges.states), noise)
 
 
@@ -70,6 +82,17 @@ def _row_by_row(blocks: Blocks) -> bool:
         return False
     noise = blocks["edge"].noise
     return bool((noise[:, 2] <= 0).any() and (noise[:, 5] > 0).all())
+
+
+def _turned(information: Array, theta: Array) -> Array:
+    """(M, 3, 3) information of x y theta, along axes that are turned by theta; what looks the same from all sides stays."""
+    xy, xt, yt = information[:, 0, 1], information[:, 0, 2], information[:, 1, 2]
+    alike = (information[:, 0, 0] == information[:, 1, 1]) & (xy == 0) & (xt == 0) & (yt == 0)
+    R = np.tile(np.eye(3), (len(theta), 1, 1))
+    R[:, 0, 0] = R[:, 1, 1] = np.cos(theta)
+    R[:, 1, 0] = np.sin(theta)
+    R[:, 0, 1] = -R[:, 1, 0]
+    return np.asarray(np.where(alike[:, None, None], information, np.swapaxes(R, 1, 2) @ information @ R))
 
 
 def _with_quaternions(block: Block) -> Block:
