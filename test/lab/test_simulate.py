@@ -2,6 +2,7 @@
 
 import itertools
 from collections import Counter
+from pathlib import Path
 
 import gtsam
 import numpy as np
@@ -250,3 +251,16 @@ def test_options_that_make_no_sense_are_refused_by_name(options: dict, said: str
 def test_an_unknown_scenario_is_refused_with_the_known_ones() -> None:
     with pytest.raises(BadConfig, match="known: square, corridor, city"):
         simulate("moon")
+
+
+def test_the_bag_in_the_repository_is_what_its_readme_says() -> None:
+    """The same messages as the command there makes; poses agree beyond what CPUs may differ in."""
+    bags = Path(__file__).parents[2] / "bags"
+    simulation = simulate("warehouse", 1)
+    with open_bag(bags / "warehouse.mcap") as bag:
+        stored = [(r.topic, r.type, r.log_time, len(r.data)) for r in bag.records()]
+    assert stored == [(r.topic, r.type, r.log_time, len(r.data)) for r in simulation.records]
+    truth = np.loadtxt(bags / "warehouse.truth.tum", usecols=range(1, 8))
+    np.testing.assert_allclose(truth, simulation.sevens, atol=1e-9)
+    settings = yaml.safe_load((bags / "warehouse.yaml").read_text())
+    assert config_from(settings) == config_from(simulation.settings)
