@@ -46,6 +46,8 @@ class Options:
                 raise BadConfig(f"{field.name}: is a fraction and must not exceed 1 (it says {value})")
         if self.poses < 2:
             raise BadConfig(f"poses: a drive needs at least 2 (it says {self.poses})")
-        for name in ("period", "loop_sigma_translation", "loop_sigma_rotation", "landmark_sigma"):
+        if self.period < 1e-6:
+            raise BadConfig(f"period: must be at least 1e-6 s (it says {self.period})")
+        for name in ("loop_sigma_translation", "loop_sigma_rotation", "landmark_sigma"):
             if getattr(self, name) == 0:
                 raise BadConfig(f"{name}: must be greater than 0")
