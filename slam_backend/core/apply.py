@@ -3,8 +3,11 @@
 from collections.abc import Callable, Collection
 from typing import Any
 
+import numpy as np
+
 from .errors import SolverFailure
 from .graph import UNTIL_JOINED, Decision, Delta, Estimate, Factor, Pose, is_pose
+from .measurement import Array
 from .parts import Parts
 from .solvers import Solver
 from .space import Space
@@ -24,6 +27,9 @@ class Applier:
         """wake: called with the key of each new landmark, and with UNTIL_JOINED when two parts become one."""
         self._solver, self._space, self._parts, self._wake = solver, space, parts, wake
         self.estimate: Estimate | None = None
+        self.sighted: dict[
+            int, tuple[int, Array]
+        ] = {}  # landmark -> the pose that saw it first, and where from there
         self.decisions: list[Decision] = []
 
     def take_decisions(self) -> list[Decision]:
@@ -113,9 +119,18 @@ class Applier:
             fresh = [key for key in factor.keys if self._parts.of(key) is None]
             for key in fresh:
                 self._parts.put(key, factor.keys[0])
+                self.sighted[key] = (factor.keys[0], self._from(factor.keys[0], delta, key))
                 self._wake(key)
             if factor.kind in ("loop", "pose"):
                 self.decisions.append(_accepted(factor))
+
+    def _from(self, pose_key: int, delta: Delta, key: int) -> Array:
+        """The first guess of a landmark, seen from a pose."""
+        assert self.estimate is not None
+        pose = delta.values.get(pose_key)
+        return np.asarray(
+            (self.estimate.pose(pose_key) if pose is None else pose).transformTo(delta.values[key])
+        )
 
 
 def without(delta: Delta, ids: Collection[str]) -> Delta:

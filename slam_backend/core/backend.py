@@ -102,22 +102,23 @@ class Backend:
         return updates
 
     def finish(self) -> list[Update]:
-        """The input has ended: land what still waits, then linearize everything anew."""
+        """The input has ended: land what still waits; decide about what cannot land."""
         updates: list[Update] = []
         if self._relative:
             updates += self._close()
         elif self._newest and self.track.newest > self._newest[0].stamp:
             updates += self._extend(self.track.newest)
-        while self._newest and self._pending:
-            if not (window := self._window(self._newest[0].stamp)):
-                break
+        while self._newest and (window := self._window(self._newest[0].stamp)):
             updates += self._update(self._newest[0], self._factors(window, None, self._newest[0], {}), ())
         self._refuse_leftovers()
-        if self._newest:
-            self._applier.estimate = self.solver.polish()
         if self._newest and self._decisions:
             updates.append(self._told(self._newest[0]))
         return updates
+
+    def polish(self) -> None:
+        """Linearize everything anew at the present estimate; what iSAM2 believes rests on older points."""
+        if self._newest:
+            self._applier.estimate = self.solver.polish()
 
     @property
     def estimate(self) -> Estimate:
@@ -146,6 +147,17 @@ class Backend:
             points,
             self._revision,
         )
+
+    def dead_reckoning(self) -> gtsam.Values:
+        """Where everything would be by odometry alone, landmarks where their first sighting puts them."""
+        values = gtsam.Values()
+        keyframes = self.timeline.in_order()
+        start = self.estimate.pose(keyframes[0].pose).compose(self.track.pose(keyframes[0].stamp).inverse())
+        for each in keyframes:
+            values.insert(each.pose, start.compose(self.track.pose(each.stamp)))
+        for key, (pose_key, point) in self._applier.sighted.items():
+            values.insert(key, self.space.pose_in(values, pose_key).transformFrom(point))
+        return values
 
     # -- the way of a measurement ----------------------------------------------------------------
 
@@ -306,11 +318,12 @@ class Backend:
             self._mounts,
             lambda stamp: self.timeline.place(stamp, self.track, self.space),
             self.track.motion,
-            self._landmark,
+            self.landmark,
             self.parts.of,
         )
 
-    def _landmark(self, name: str) -> int:
+    def landmark(self, name: str) -> int:
+        """The key of a landmark by its name; a new name gets a new key."""
         return self._landmarks.setdefault(name, landmark_key(len(self._landmarks)))
 
     # -- the way of a change ---------------------------------------------------------------------

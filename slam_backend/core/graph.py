@@ -93,6 +93,7 @@ class Decision:
     statistic: float | None = None
     threshold: float | None = None
     ends: tuple[int, int] | None = None  # the two stamps of a relative measurement
+    count: int = 1  # how many records of one second it stands for
 
 
 @dataclass(frozen=True, slots=True, eq=False)

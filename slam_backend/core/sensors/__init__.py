@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 from ..context import Context
 from ..graph import Delta, Keyframe, Offer
 from ..measurement import Decoder
-from . import landmark, odometry, pose, relative
+from . import landmark, odometry, pose, relative, static
 
 
 class Sensor(NamedTuple):
@@ -25,4 +25,5 @@ SENSORS: Mapping[str, Sensor] = {
     "relative": Sensor(relative.DECODERS, relative.factors),
     "landmark": Sensor(landmark.DECODERS, landmark.factors),
     "pose": Sensor(pose.DECODERS, pose.factors),
+    "static": Sensor(static.DECODERS, static.factors),
 }

@@ -23,6 +23,7 @@ from ..measurement import Array
 from ..space import Space
 
 SETTLED = 1e-9  # largest change of a variable (m, rad) at which a rebuild is done
+ROUNDING = 1e-10  # relative change of the cost that is only the rounding of the normal equations
 ROUNDS = 30  # of re-linearization in a rebuild
 JOINING = frozenset({"loop", "pose"})  # kinds of factors after which one update is not enough
 
@@ -171,7 +172,7 @@ class Isam2:
             if not (np.isfinite(step) and np.isfinite(now)):
                 raise RuntimeError("the rebuilt estimate is not finite")
             values = found
-            if step < SETTLED or abs(error - now) <= 1e-12 * now:
+            if step < SETTLED or abs(error - now) <= ROUNDING * now:
                 return isam, slots
             error = now
         raise RuntimeError("the rebuilt estimate does not settle")

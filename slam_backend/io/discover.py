@@ -1,0 +1,135 @@
+"""A configuration for an input that came without one: what its topics are, by type and first message."""
+
+from collections.abc import Iterable, Iterator
+from itertools import islice
+from typing import Any
+
+from ..core.config import Config, config_from
+from ..core.errors import BadConfig, BadMessage
+from ..core.sensors.cloud import columns
+from ..core.sensors.odometry import DECODERS as ODOMETRY
+from .bags import Bag
+from .inputs import EDGES, LANDMARKS, BagInputs, GraphInput
+
+ENOUGH = 200  # odometry messages that are looked at to tell whether the robot moves in a plane
+TRUTH = (
+    "truth",
+    "ground",
+    "_gt",
+    "/gt",
+    "vicon",
+    "mocap",
+)  # parts of names of topics that must not become input
+
+
+def discover(inputs: BagInputs | GraphInput) -> tuple[Config, list[str]]:
+    """The configuration, and lines that say what was chosen and what was left aside. BadConfig when nothing drives."""
+    if isinstance(inputs, GraphInput):
+        return _of_graph(inputs), []
+    kinds, notes = _kinds_of(inputs)
+    sources: dict[str, dict[str, Any]] = {}
+    for topic, kind in kinds.items():
+        name = topic.strip("/").replace("/", "_") or kind
+        sources[name] = {"kind": kind, "topic": topic}
+    if not any(kind in ("odometry", "relative") for kind in kinds.values()):
+        where = ", ".join(str(path) for path in inputs.paths)
+        has = (
+            ", ".join(f"{name} ({topic.type})" for name, topic in inputs.topics.items()) or "no topics at all"
+        )
+        raise BadConfig(
+            f"{where}: no odometry and no relative poses in it that could drive the keyframes; it has {has}"
+        )
+    space = "2d" if _planar(inputs, kinds) else "3d"
+    notes.append(f"space {space}: the poses {'lie in a plane' if space == '2d' else 'leave the plane'}")
+    return config_from({"space": space, "sources": list(sources), **sources}), notes
+
+
+def _of_graph(inputs: GraphInput) -> Config:
+    sources: dict[str, Any] = {EDGES: {"kind": "relative"}}
+    if len(inputs.graph.sightings):
+        sources[LANDMARKS] = {"kind": "landmark"}
+    return config_from({"space": inputs.graph.space, "sources": list(sources), **sources})
+
+
+def _kinds_of(inputs: BagInputs) -> tuple[dict[str, str], list[str]]:
+    """Topic -> kind, one odometry only: the one with most messages."""
+    kinds: dict[str, str] = {}
+    notes: list[str] = []
+    for topic, (first, bag) in _first_messages(inputs).items():
+        if any(part in topic.lower() for part in TRUTH):
+            notes.append(f"{topic} is taken for ground truth and left aside")
+            continue
+        kind = _kind(bag, first)
+        if kind is not None:
+            kinds[topic] = kind
+    odometries = [topic for topic, kind in kinds.items() if kind == "odometry"]
+    best = max(
+        odometries,
+        key=lambda topic: (inputs.topics[topic].type == "nav_msgs/msg/Odometry", inputs.topics[topic].count),
+        default=None,
+    )
+    for topic in odometries:
+        if topic != best:
+            del kinds[topic]
+            notes.append(f"{topic} is left aside: {best} is the odometry")
+    notes += [f"{topic} is used as {kind}" for topic, kind in kinds.items()]
+    return kinds, notes
+
+
+def _first_messages(inputs: BagInputs) -> dict[str, tuple[Any, Bag]]:
+    first: dict[str, tuple[Any, Bag]] = {}
+    types = {*ODOMETRY, "sensor_msgs/msg/PointCloud2"}
+    for bag in inputs.bags:
+        for topic, what in bag.topics.items():
+            if what.type in types and topic not in first:
+                for record in islice(bag.records({topic}), 1):
+                    first[topic] = (record, bag)
+    return first
+
+
+def _kind(bag: Bag, record: Any) -> str | None:
+    """What a topic is, from its first message; None when it is nothing that can be used."""
+    try:
+        message: Any = bag.typestore.deserialize_cdr(record.data, record.type)
+    except Exception:  # noqa: BLE001  # any damage: the decoder will say it, message by message
+        return None
+    if record.type == "sensor_msgs/msg/PointCloud2":
+        return _kind_of_cloud(message)
+    if "@" in message.header.frame_id:
+        return "relative"
+    in_map = message.header.frame_id.lstrip("/") == "map"
+    return "pose" if in_map and record.type == "geometry_msgs/msg/PoseWithCovarianceStamped" else "odometry"
+
+
+def _kind_of_cloud(message: Any) -> str | None:
+    try:
+        names = set(columns(message))
+    except BadMessage:
+        return None
+    if "stamp_i_sec" in names:
+        return "relative"
+    return "landmark" if "id" in names and ({"x", "y"} <= names or "azimuth" in names) else None
+
+
+def _planar(inputs: BagInputs, kinds: dict[str, str]) -> bool:
+    """Whether z, roll and pitch are exactly zero in the first poses of the source that drives."""
+    driving = next((t for t, k in kinds.items() if k == "odometry"), None) or next(
+        t for t, k in kinds.items() if k == "relative"
+    )
+    poses = list(islice(_poses(inputs, driving), ENOUGH))
+    return bool(poses) and all(
+        p.position.z == 0 and p.orientation.x == 0 and p.orientation.y == 0 for p in poses
+    )
+
+
+def _poses(inputs: BagInputs, topic: str) -> Iterator[Any]:
+    for bag in inputs.bags:
+        records: Iterable[Any] = bag.records({topic}) if topic in bag.topics else ()
+        for record in records:
+            if record.type == "sensor_msgs/msg/PointCloud2":
+                return
+            try:
+                message: Any = bag.typestore.deserialize_cdr(record.data, record.type)
+            except Exception:  # noqa: BLE001, S112  # as above
+                continue
+            yield getattr(message.pose, "pose", message.pose)

@@ -1,0 +1,258 @@
+"""The same core, driven by recorded logs: records in, updates out, a result at the end."""
+
+import platform
+import resource
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from time import perf_counter
+from typing import Any
+
+import gtsam
+import numpy as np
+
+from ..core.backend import Backend, Update
+from ..core.check import checked, rechecked
+from ..core.config import Config, config_hash
+from ..core.decisions import DecisionLog
+from ..core.errors import BadFile
+from ..core.fingerprint import run_hash
+from ..core.graph import Decision, Factor
+from ..core.measurement import SECOND, Measurement
+from ..core.settle import settled
+from ..core.trajectory import Snapshot, Trajectory
+from .discover import discover
+from .inputs import BagInputs, GraphInput, open_inputs
+
+VERSIONS = ("slam_backend", "gtsam", "numpy", "rosbags")
+
+
+def replay(inputs: Path | str | Sequence[Path | str], config: Config | None = None) -> "Run":
+    """Replay bags, journals or a pose graph. Iterate the Run for its updates, or ask for its `result`.
+
+    config: None finds the sources by the types of the topics. SlamError says what is wrong with the input.
+    """
+    paths = [inputs] if isinstance(inputs, Path | str) else list(inputs)
+    opened = open_inputs(paths)
+    notes: list[str] = []
+    try:
+        if config is None:
+            config, notes = discover(opened)
+        elif not config.sources:
+            found, notes = discover(opened)
+            config = config.model_copy(update={"sources": found.sources})
+        return Run(opened, config, notes)
+    except BaseException:
+        opened.close()
+        raise
+
+
+def settled_stream(
+    items: Iterable[Measurement | Decision], config: Config
+) -> Iterator[Measurement | Decision]:
+    """The way from decoded measurements to what the back-end takes: the same live and offline."""
+    lag = round(config.settle.lag * SECOND)
+    driver = config.driver
+    assert driver is not None
+    return rechecked(settled(checked(items, config), driver, lag), config)
+
+
+class Run:
+    """One replay. An iterator of updates; progress, early stop and fleets wrap it from outside."""
+
+    def __init__(self, inputs: BagInputs | GraphInput, config: Config, notes: list[str]) -> None:
+        self.config, self.notes, self.inputs = config, notes, inputs
+        self.backend = Backend(config)
+        self.decisions = DecisionLog()
+        self.seconds = Seconds()
+        self.measurements = 0
+        self._online: list[tuple[int, tuple[float, ...]]] = []
+        self._online_cost = 0.0
+        self._updates = self._run()
+
+    def __iter__(self) -> Iterator[Update]:
+        return self._updates
+
+    @cached_property
+    def result(self) -> "Result":
+        """What came of it; runs what is left of the input first."""
+        for _ in self._updates:
+            pass
+        return Result(self)
+
+    @property
+    def online(self) -> Trajectory:
+        """What was believed of each keyframe when it was newest."""
+        stamps = np.array([stamp for stamp, _ in self._online], dtype=np.int64)
+        return Trajectory(stamps, np.array([seven for _, seven in self._online]).reshape(-1, 7))
+
+    @property
+    def online_cost(self) -> float:
+        """chi2/2 of the kept factors at the last online estimate, gauges left out."""
+        return self._online_cost
+
+    def _run(self) -> Iterator[Update]:
+        with self.inputs:
+            stream = settled_stream(self.inputs.stream(self.config), self.config)
+            start = perf_counter()
+            while (item := next(stream, None)) is not None:
+                if isinstance(item, Decision):
+                    self.decisions.add(item)
+                    continue
+                self.measurements += 1
+                before = perf_counter()
+                updates = self.backend.add(item)
+                self.seconds.solve(perf_counter() - before, len(updates))
+                yield from self._take(updates)
+            yield from self._finish()
+            self.seconds.wall = perf_counter() - start
+
+    def _finish(self) -> Iterator[Update]:
+        before = perf_counter()
+        yield from self._take(self.backend.finish())
+        if not len(self.backend.timeline):
+            raise BadFile(_nothing(self))
+        self._online_cost = cost(self.backend.solver.factors.values(), self.backend.estimate.values())
+        self.backend.polish()
+        self.seconds.solve(perf_counter() - before, 0)
+
+    def _take(self, updates: Sequence[Update]) -> Iterator[Update]:
+        for update in updates:
+            self.decisions.extend(update.decisions)
+            if not self._online or update.keyframe.stamp > self._online[-1][0]:
+                self._online.append((update.keyframe.stamp, update.pose))
+            yield update
+
+
+class Seconds:
+    """Where the time of a run went; for people, never for a verdict."""
+
+    def __init__(self) -> None:
+        self.wall = 0.0
+        self.solving = 0.0
+        self._updates: list[float] = []
+
+    def solve(self, seconds: float, updates: int) -> None:
+        self.solving += seconds
+        if updates:
+            self._updates.append(seconds)
+
+    def summary(self) -> dict[str, Any]:
+        ms = np.array(self._updates or [0.0]) * 1e3
+        percentiles = {f"p{p}": round(float(np.percentile(ms, p)), 3) for p in (50, 95, 99)}
+        return {
+            "wall_s": round(self.wall, 3),
+            "read_s": round(max(self.wall - self.solving, 0.0), 3),
+            "solve_s": round(self.solving, 3),
+            "update_ms": {**percentiles, "max": round(float(ms.max()), 3)},
+        }
+
+
+@dataclass(frozen=True, eq=False)
+class Result:
+    """The end of a run: estimate, decisions, summary."""
+
+    run: Run
+
+    @cached_property
+    def snapshot(self) -> Snapshot:
+        return self.run.backend.snapshot()
+
+    @property
+    def trajectory(self) -> Trajectory:
+        """map_T_base at every keyframe."""
+        return self.snapshot.trajectory
+
+    @property
+    def decisions(self) -> DecisionLog:
+        return self.run.decisions
+
+    @property
+    def factors(self) -> Sequence[Factor]:
+        """Those kept, in the order in which they came."""
+        return list(self.run.backend.solver.factors.values())
+
+    @cached_property
+    def values(self) -> gtsam.Values:
+        return self.run.backend.estimate.values()
+
+    @cached_property
+    def summary(self) -> dict[str, Any]:
+        """What summary.json holds."""
+        run, loops = self.run, self.decisions.loops()
+        return {
+            "input": [str(path) for path in run.inputs.paths],
+            "run_hash": run_hash(self.factors, self.decisions, self.values, self.trajectory.sevens),
+            "config_hash": config_hash(run.config),
+            "seed": 0,
+            "counts": {
+                "records": run.inputs.read,
+                "measurements": run.measurements,
+                "keyframes": len(self.trajectory),
+                "landmarks": len(self.snapshot.names),
+                "factors": len(self.factors),
+                "parts": len(run.backend.parts),
+                "loops_offered": sum(loops.values()),
+                "loops_accepted": loops.get("accepted", 0) + loops.get("restored", 0),
+                "loops_probation": loops.get("probation", 0),
+                "loops_refused": loops.get("refused", 0) + loops.get("removed", 0),
+            },
+            "decisions": self.decisions.by_rule(),
+            "cost": {
+                "initial": cost(self.factors, run.backend.dead_reckoning()),
+                "online": run.online_cost,
+                "final": cost(self.factors, self.values),
+            },
+            "timing": run.seconds.summary(),
+            "memory_mb": round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024, 1),
+            "versions": versions(),
+            "damage": run.inputs.damage,
+            "notes": run.notes,
+        }
+
+
+def cost(factors: Iterable[Factor], values: gtsam.Values) -> float:
+    """chi2/2, gauges left out."""
+    graph = gtsam.NonlinearFactorGraph()
+    for factor in factors:
+        if factor.kind != "gauge":
+            graph.add(factor.factor)
+    return float(graph.error(values))
+
+
+def versions() -> dict[str, str]:
+    """Of what decides the bits of a result."""
+    found = {
+        "python": platform.python_version(),
+        "machine": platform.machine(),
+        "cpu": ",".join(_cpu_features()),
+    }
+    for name in VERSIONS:
+        try:
+            found[name] = version(name)
+        except PackageNotFoundError:
+            found[name] = "not installed"
+    return found
+
+
+def _cpu_features() -> list[str]:
+    """Those on which glibc, OpenBLAS and numpy choose their code."""
+    try:
+        flags = next(
+            line for line in Path("/proc/cpuinfo").read_text().splitlines() if line.startswith("flags")
+        )
+    except (OSError, StopIteration):
+        return []
+    return [name for name in ("sse4_2", "avx", "fma", "avx2", "avx512f") if name in flags.split()]
+
+
+def _nothing(run: Run) -> str:
+    """Why there is no trajectory, in one line."""
+    driver = run.config.driver
+    refused = {rule: n for rule, n in run.decisions.by_rule().items() if n}
+    why = ", ".join(f"{rule} {n}" for rule, n in refused.items()) or "it holds none"
+    damage = "; ".join(run.inputs.damage)
+    where = ", ".join(str(path) for path in run.inputs.paths)
+    return f"{where}: not one usable message of source '{driver}' ({why})" + (f"; {damage}" if damage else "")
