@@ -22,7 +22,7 @@ from ..core.errors import BadFile
 from .records import Record
 from .storage import open_storage
 from .storage.folder import Folder, open_file, read_folder
-from .storage.parts import Contents, Part, Row, Source, Topics, inflate
+from .storage.parts import Contents, Part, Row, Source, Topics, inflate, one_line
 from .typestore import typestore_of
 from .writing import write_bag
 
@@ -89,10 +89,8 @@ class Bag:
     def damage(self) -> list[str]:
         """One line for each thing that is missing or wrong: file, place, what was lost. Complete after `records`."""
         lines = [*self._opened.damage, *(line for source in self._opened.sources for line in source.damage)]
-        lines += [
-            f"{self.path}: {count} messages of {topic} left out: {why}"
-            for topic, (count, why) in self._lost.items()
-        ]
+        for topic, (count, why) in self._lost.items():
+            lines.append(f"{self.path}: {one_line(f'{count} messages of {topic} left out: {why}')}")
         return lines or ([] if self.count else [f"{self.path}: holds no messages"])
 
     @cached_property

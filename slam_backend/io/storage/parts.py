@@ -45,6 +45,11 @@ class Contents(NamedTuple):
     parts: Sequence[Part]
 
 
+def one_line(text: str) -> str:
+    """Names and errors that come out of damaged bytes may hold anything."""
+    return " ".join(text.split())
+
+
 class Source:
     """A file that is read at any place; beyond its end there is simply nothing. Collects what is wrong with it."""
 
@@ -70,11 +75,11 @@ class Source:
 
     def say(self, line: str) -> None:
         """Record damage: the place, and what was lost. Said once, however often it is met."""
-        if (line := f"{self.name}: {line}") not in self.damage:
+        if (line := f"{self.name}: {one_line(line)}") not in self.damage:
             self.damage.append(line)
 
     def bad(self, what: str) -> BadFile:
-        return BadFile(f"{self.name}: {what}")
+        return BadFile(f"{self.name}: {one_line(what)}")
 
     def close(self) -> None:
         self._file.close()

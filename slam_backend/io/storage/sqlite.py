@@ -16,6 +16,7 @@ from tempfile import TemporaryDirectory
 from .parts import Connection, Contents, Part, Row, Source, Topics
 
 MAGIC = b"SQLite format 3\0"
+_UNREADABLE = (sqlite3.Error, UnicodeDecodeError)  # the latter when the schema itself is damaged
 
 
 class _Bag:
@@ -26,16 +27,17 @@ class _Bag:
         self.stray: int | None = None  # the first row that is no message
 
     def _topics(self) -> dict[int, Connection]:
+        """By row; names that are damaged are replaced, for what they are worth."""
         definitions: dict[str, tuple[str, str]] = {}
         if self.database.execute("PRAGMA table_info(message_definitions)").fetchall():
             definitions = {
-                name: (encoding, text)
+                str(name): (str(encoding), str(text))
                 for name, encoding, text in self.database.execute(
                     "SELECT topic_type, encoding, encoded_message_definition FROM message_definitions"
                 )
             }
         return {
-            identity: Connection(topic, kind, encoding, *definitions.get(kind, ()))
+            identity: Connection(str(topic), str(kind), str(encoding), *definitions.get(kind, ()))
             for identity, topic, kind, encoding in self.database.execute(
                 "SELECT id, name, type, serialization_format FROM topics"
             )
@@ -57,6 +59,8 @@ class _Bag:
         ):
             if topic in self.topics:
                 self.counts[self.topics[topic].topic] += count
+            else:
+                self.source.say(f"{count} rows belong to no topic: left out")
         (start,) = self.database.execute("SELECT min(timestamp) FROM messages").fetchone()
         parts = [] if start is None else [Part(start, self.rows)]
         return Contents(tuple(self.topics.values()), self.counts, parts)
@@ -64,13 +68,13 @@ class _Bag:
     def rows(self, topics: Topics) -> Iterator[Row]:
         wanted = [n for n, connection in self.topics.items() if topics is None or connection.topic in topics]
         query = (
-            "SELECT id, topic_id, timestamp, data FROM messages "  # noqa: S608  # only numbers are put in
-            f"WHERE topic_id IN ({','.join(map(str, wanted))}) ORDER BY timestamp, id"
+            "SELECT id, topic_id, timestamp, data FROM messages "  # noqa: S608  # only question marks are put in
+            f"WHERE topic_id IN ({','.join('?' * len(wanted))}) ORDER BY timestamp, id"
         )
         same: list[Row] = []  # rows with equal log times, to be ordered by topic
         last = None
         try:
-            for found in self.database.execute(query):
+            for found in self.database.execute(query, wanted):
                 row = self.row(*found)
                 if row is None:
                     continue
@@ -79,7 +83,7 @@ class _Bag:
                     same.clear()
                 same.append(row)
                 last = row[0]
-        except sqlite3.Error as error:
+        except _UNREADABLE as error:
             place = "the first message" if last is None else f"log time {last} ns"
             self.source.say(f"cannot be read beyond {place}: {error}; the rest is lost")
         yield from sorted(same)
@@ -94,7 +98,7 @@ class _Bag:
                 row = self.row(identity, topic, log_time, data)
                 if row is not None:
                     found.append(row[:3])
-        except sqlite3.Error as error:
+        except _UNREADABLE as error:
             self.source.say(
                 f"rows after {found[-1][2] if found else 0} cannot be read: {error}; they are lost"
             )
@@ -104,17 +108,23 @@ class _Bag:
         return Contents(tuple(self.topics.values()), self.counts, parts)
 
     def fetch(self, found: list[tuple[int, str, int]], topics: Topics) -> Iterator[Row]:
+        query = "SELECT id, topic_id, timestamp, data FROM messages WHERE id = ?"
         for _, topic, identity in found:
-            if topics is None or topic in topics:
-                row = self.database.execute(
-                    "SELECT id, topic_id, timestamp, data FROM messages WHERE id = ?", (identity,)
-                ).fetchone()
-                if (made := self.row(*row)) is not None:
-                    yield made
+            if topics is not None and topic not in topics:
+                continue
+            try:
+                answer = self.database.execute(query, (identity,)).fetchone()
+            except _UNREADABLE as error:
+                answer = None
+                self.source.say(f"some rows that were there cannot be fetched: {error}; they are lost")
+            row = self.row(*(answer or (identity, 0, None, None)))
+            if row is not None:
+                yield row
 
 
 def _connect(path: Path, how: str, stack: ExitStack) -> sqlite3.Connection:
     database = sqlite3.connect(f"{path.absolute().as_uri()}?{how}", uri=True)
+    database.text_factory = lambda raw: raw.decode(errors="replace")
     stack.callback(database.close)
     return database
 
@@ -147,7 +157,7 @@ def _is_cut(source: Source) -> bool:
 def _open_logged(source: Source, logs: list[Path], stack: ExitStack) -> Contents:
     try:  # a database in use is read where it lies
         return _Bag(source, _connect(source.path, "mode=ro", stack)).indexed()
-    except sqlite3.Error:  # what a crash left needs writing before it can be read: on a copy
+    except _UNREADABLE:  # what a crash left needs writing before it can be read: on a copy
         folder = Path(stack.enter_context(TemporaryDirectory()))
         for file in (source.path, *logs):
             shutil.copyfile(file, folder / file.name)
@@ -171,9 +181,9 @@ def open_sqlite(source: Source, stack: ExitStack) -> Contents:
             return _recover(source, "cut off", stack)
         try:
             return _Bag(source, _connect(source.path, "immutable=1", stack)).indexed()
-        except sqlite3.DatabaseError as error:
+        except _UNREADABLE as error:
             if "no such" in str(error):  # a database of something else
                 raise
             return _recover(source, str(error), stack)
-    except (sqlite3.Error, OSError) as error:
+    except (*_UNREADABLE, OSError) as error:
         raise source.bad(f"not a readable rosbag2 database: {error}; copy or record it again") from None
