@@ -19,7 +19,7 @@ from ...core.measurement import Array, frozen
 from .assemble import assemble
 from .blocks import Block, Line, Table, read_block, read_blocks, tags_of, write_block, written_ids
 from .lines import Rows, by_tag, read_rows, write_lines
-from .noise import HALF_ANGLE, SE2, SE3, XY, XYZ, fold
+from .noise import HALF_ANGLE, SE2, SE3, XY, XYZ, fold, turned
 from .posegraph import Convention, PoseGraph, Sightings
 
 TABLE: Table = {
@@ -50,7 +50,10 @@ def read(path: Path, rotation_information: Convention = "gtsam") -> PoseGraph:
     graph = assemble(space, blocks, notes, weights=HALF_ANGLE if rotation_information == "g2o" else None)
     if space == "3d" and "sighting" in blocks:
         offsets = _offsets(blocks["sighting"], read_block(OFFSET, groups[OFFSET.tag]))
-        return replace(graph, sightings=_in_vertex_frame(graph.sightings, offsets))
+        sightings = _in_vertex_frame(graph.sightings, offsets)
+        if not (finite := np.isfinite(sightings.states).all(axis=1)).all():
+            raise blocks["sighting"].bad(int(finite.argmin()), "is too far away for a number")
+        return replace(graph, sightings=sightings)
     return graph
 
 
@@ -104,8 +107,9 @@ def _in_vertex_frame(sightings: Sightings, vertex_T_sensor: Array) -> Sightings:
     if not vertex_T_sensor[:, :6].any():
         return sightings
     turn = rotation_of(vertex_T_sensor[:, 3:])
-    states = (turn @ sightings.states[:, :, None])[:, :, 0] + vertex_T_sensor[:, :3]
-    information = turn @ sightings.information @ np.swapaxes(turn, 1, 2)
+    with np.errstate(all="ignore"):
+        states = (turn @ sightings.states[:, :, None])[:, :, 0] + vertex_T_sensor[:, :3]
+    information = turned(sightings.information, np.swapaxes(turn, 1, 2))
     return replace(sightings, states=frozen(states), information=frozen(information))
 
 

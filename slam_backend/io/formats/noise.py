@@ -42,6 +42,15 @@ def fold(matrices: Array, pairs: Pairs) -> Array:
     return np.asarray(matrices[:, rows, columns])
 
 
+def turned(matrices: Array, rotations: Array) -> Array:
+    """R^T M R, symmetric to the bit: (M, d, d) information along the axes that R, (M, d, d), has in those of before."""
+    with np.errstate(all="ignore"):
+        result = (
+            np.swapaxes(rotations, 1, 2) @ (matrices / 2) @ rotations
+        )  # halves, so that their sum cannot overflow
+        return np.asarray(result + np.swapaxes(result, 1, 2))
+
+
 def least_correlation(matrices: Array) -> Array:
     """(M,) the smallest eigenvalue of each matrix after scaling its diagonal to one; negative: indefinite.
 
@@ -68,4 +77,4 @@ def inverse(matrices: Array) -> Array:
         good = np.isfinite(scaled).all(axis=(1, 2)) & (least_correlation(matrices) > 1e-12)
         result = np.full(matrices.shape, np.nan)
         result[good] = np.linalg.inv(scaled[good]) * outer[good]
-        return np.asarray((result + np.swapaxes(result, 1, 2)) / 2)
+        return np.asarray(result / 2 + np.swapaxes(result, 1, 2) / 2)

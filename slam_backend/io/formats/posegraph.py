@@ -201,6 +201,6 @@ def _inverse_of(information: Array) -> Array:
     """Covariances; a direction without information gets a sigma 30,000 times that of the best one, a zero matrix NaN."""
     values, vectors = np.linalg.eigh(information)
     best = values.max(axis=-1, keepdims=True, initial=0)
-    with np.errstate(divide="ignore", invalid="ignore"):
+    with np.errstate(all="ignore"):  # 1e-320 has no finite inverse; the firewall says so
         inverse = np.where(best > 0, 1 / np.maximum(values, 1e-9 * best), np.nan)
-    return np.asarray((vectors * inverse[:, None, :]) @ np.swapaxes(vectors, -1, -2))
+        return np.asarray((vectors * inverse[:, None, :]) @ np.swapaxes(vectors, -1, -2))

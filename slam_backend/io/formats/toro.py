@@ -18,7 +18,7 @@ from ...core.measurement import Array, frozen
 from .assemble import assemble
 from .blocks import Block, Blocks, Line, Table, read_blocks, tags_of, write_block, written_ids
 from .lines import by_tag, read_rows, write_lines
-from .noise import SE2, SE2_TORO, SE3, fold
+from .noise import SE2, SE2_TORO, SE3, fold, turned
 from .posegraph import PoseGraph
 
 TABLE: Table = {
@@ -46,7 +46,7 @@ def read(path: Path) -> PoseGraph:
     graph = assemble(space, blocks, notes)
     if space == "3d" or not len(graph.edges):
         return graph
-    information = frozen(_turned(graph.edges.information, graph.edges.states[:, 2]))
+    information = frozen(_turned_by(graph.edges.information, graph.edges.states[:, 2]))
     return replace(graph, edges=replace(graph.edges, information=information))
 
 
@@ -71,7 +71,7 @@ def _lines(path: Path, graph: PoseGraph) -> Iterator[str]:
     if len(edges):
         ends = [written_ids(graph.ids, edges.i), written_ids(graph.ids, edges.j)]
         planar = graph.space == "2d"
-        information = _turned(edges.information, -edges.states[:, 2]) if planar else edges.information
+        information = _turned_by(edges.information, -edges.states[:, 2]) if planar else edges.information
         noise = fold(information, table["edge"].noise)
         yield from write_block(path, table["edge"], ends, _stated(graph, edges.states), noise)
 
@@ -84,7 +84,7 @@ def _row_by_row(blocks: Blocks) -> bool:
     return bool((noise[:, 2] <= 0).any() and (noise[:, 5] > 0).all())
 
 
-def _turned(information: Array, theta: Array) -> Array:
+def _turned_by(information: Array, theta: Array) -> Array:
     """(M, 3, 3) information of x y theta, along axes that are turned by theta; what looks the same from all sides stays."""
     xy, xt, yt = information[:, 0, 1], information[:, 0, 2], information[:, 1, 2]
     alike = (information[:, 0, 0] == information[:, 1, 1]) & (xy == 0) & (xt == 0) & (yt == 0)
@@ -92,7 +92,7 @@ def _turned(information: Array, theta: Array) -> Array:
     R[:, 0, 0] = R[:, 1, 1] = np.cos(theta)
     R[:, 1, 0] = np.sin(theta)
     R[:, 0, 1] = -R[:, 1, 0]
-    return np.asarray(np.where(alike[:, None, None], information, np.swapaxes(R, 1, 2) @ information @ R))
+    return np.asarray(np.where(alike[:, None, None], information, turned(information, R)))
 
 
 def _with_quaternions(block: Block) -> Block:
