@@ -12,6 +12,11 @@ from .posegraph import Edges, Links, PoseGraph, Priors, Ranges, Sightings, Space
 
 INDEFINITE = -1e-9  # smallest scaled eigenvalue that the rounding of a file's decimals explains
 LETTER_L = ord("L")  # what PyFG calls a landmark
+Mention = tuple[Role, int]  # (role of a line, which of its ids)
+LANDMARK_MENTIONS: tuple[Mention, ...] = (("sighting", 1), ("landmark_prior", 0), ("range", 1))
+VERTEX_MENTIONS: tuple[Mention, ...] = (
+    ("edge", 0), ("edge", 1), ("sighting", 0), ("prior", 0), ("fixed", 0), ("range", 0), ("range", 1),
+)  # fmt: skip
 
 
 def assemble(
@@ -26,45 +31,32 @@ def assemble(
     BadFile if an end has no line of its own in a file that has such lines, a vertex is stated twice differently, an
     edge ends where it begins, or a noise matrix is indefinite.
     """
-    landmarks = settled_ids(blocks, "landmark", ("sighting", 1), ("landmark_prior", 0), ("range", 1))
-    ids = settled_ids(
-        blocks,
-        "vertex",
-        ("edge", 0),
-        ("edge", 1),
-        ("sighting", 0),
-        ("prior", 0),
-        ("fixed", 0),
-        ("range", 0),
-        ("range", 1),
-    )
-    parts: dict[str, Any] = {}
+    landmarks = settled_ids(blocks, "landmark", *LANDMARK_MENTIONS)
+    ids = settled_ids(blocks, "vertex", *VERTEX_MENTIONS)
     kinds: tuple[tuple[Role, str, type[Links], Ids, Ids], ...] = (
         ("edge", "edges", Edges, ids, ids),
         ("sighting", "sightings", Sightings, ids, landmarks),
         ("prior", "priors", Priors, ids, ids),
         ("landmark_prior", "landmark_priors", Priors, landmarks, landmarks),
     )
-    for role, name, kind, i, j in kinds:
-        if role in blocks:
-            parts[name] = _links(kind, blocks[role], i, j, covariances, weights)
+    parts: dict[str, Any] = {
+        name: _links(kind, blocks[role], i, j, covariances, weights)
+        for role, name, kind, i, j in kinds
+        if role in blocks
+    }
     if "range" in blocks:
         parts["ranges"] = _ranges(blocks["range"], ids, landmarks)
     if "fixed" in blocks:
         parts["fixed"] = ranks(ids, blocks["fixed"], 0)
-    if "vertex" in blocks:
-        rows = _first_of_each(blocks["vertex"])
-        stamps = blocks["vertex"].stamps
-        parts |= {
-            "states": frozen(blocks["vertex"].states[rows]),
-            "stamps": None if stamps is None else stamps[rows],
-        }
-    return PoseGraph(
-        space, ids, landmarks=landmarks, positions=_positions(space, blocks, landmarks), notes=notes, **parts
-    )
+    if vertex := blocks.get("vertex"):
+        rows = _first_of_each(vertex)
+        parts["states"] = frozen(vertex.states[rows])
+        parts["stamps"] = None if vertex.stamps is None else vertex.stamps[rows]
+    positions = _positions(space, blocks, landmarks)
+    return PoseGraph(space, ids, landmarks=landmarks, positions=positions, notes=notes, **parts)
 
 
-def settled_ids(blocks: Blocks, stated: Role, *mentions: tuple[Role, int]) -> Ids:
+def settled_ids(blocks: Blocks, stated: Role, *mentions: Mention) -> Ids:
     """The ids that have lines of their own; in a file that has no such lines, all that are mentioned."""
     block = blocks.get(stated)
     if block is None:
