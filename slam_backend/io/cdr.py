@@ -25,11 +25,12 @@ from .records import Record
 
 Outcome = Measurement | Decision
 
-_HEAD = Struct("<HxxiII").unpack_from  # encapsulation, seconds, nanoseconds, length of the frame id
+_HEAD = Struct("<HxxiI").unpack_from  # encapsulation, seconds, nanoseconds
 _LENGTH = Struct("<I").unpack_from
 _LITTLE_ENDIAN = 0x0100  # the bytes 00 01
+_NAMES_AT = 12  # where the frame id begins; eight bytes of stamp lie before it
 _F8 = np.dtype("<f8")
-_TEXTS = 4096  # frame ids remembered at most
+_REMEMBERED, _LONG = 4096, 512  # entries at most; bytes from which on names are not worth remembering
 
 # what the typestore and the sensors' decoders raise on bytes or fields that make no sense
 _NONSENSE = (
@@ -38,61 +39,60 @@ _NONSENSE = (
 )  # fmt: skip
 
 
-class _Texts(dict[bytes, str]):
-    """Strings by their bytes with the final zero; frame ids repeat. ValueError if they are none."""
+class _Names(dict[bytes, tuple[str, ...]]):
+    """The names that stand between stamp and numbers, by their bytes: they repeat from message to message."""
 
-    def __missing__(self, raw: bytes) -> str:
-        if not raw.endswith(b"\0"):
-            raise ValueError("a string without its final zero")
-        if len(self) >= _TEXTS:
+    def __init__(self, count: int) -> None:
+        super().__init__()
+        self.count = count
+
+    def __missing__(self, raw: bytes) -> tuple[str, ...]:
+        """ValueError or struct.error unless the bytes are `count` strings and the padding up to the numbers."""
+        names, at = [], 0
+        for _ in range(self.count):
+            at += -at % 4
+            begin, at = at + 4, at + 4 + _LENGTH(raw, at)[0]
+            if not raw[begin:at].endswith(b"\0"):
+                raise ValueError("a string without its final zero")
+            names.append(raw[begin : at - 1].decode())
+        if at + -at % 8 != len(raw):
+            raise ValueError("an odd length")
+        if len(self) >= _REMEMBERED:
             self.clear()
-        text = self[raw] = raw[:-1].decode()
-        return text
+        found = tuple(names)
+        if len(raw) < _LONG:
+            self[raw] = found
+        return found
 
 
-def _numbers(data: bytes, after: int, count: int) -> Array:
-    """The `count` float64 that end the message, `after` the given byte. ValueError if it does not end there."""
-    at = after + (4 - after) % 8
-    if not 0 <= len(data) - at - 8 * count <= 3:  # up to three bytes of padding
-        raise ValueError("an odd length")
-    return np.frombuffer(data, _F8, count, at)
-
-
-def _header(data: bytes) -> tuple[int, int]:
-    """Stamp, and where the frame id ends; it begins at byte 16."""
-    encapsulation, seconds, nanoseconds, length = _HEAD(data, 0)
+def _read(data: bytes, count: int, names: _Names) -> tuple[int, tuple[str, ...], Array]:
+    """Stamp, names, and the `count` float64 that end the message."""
+    encapsulation, seconds, nanoseconds = _HEAD(data, 0)
     if encapsulation != _LITTLE_ENDIAN:
         raise ValueError("not plain little-endian CDR")
-    return seconds * SECOND + nanoseconds, 16 + length
+    at = len(data) - 8 * count
+    return seconds * SECOND + nanoseconds, names[data[_NAMES_AT:at]], np.frombuffer(data, _F8, count, at)
 
 
-def _odometry(data: bytes, source: str, texts: _Texts) -> OdometryPose:
-    """nav_msgs/msg/Odometry: 85 numbers after the child frame: pose 7, covariance 36, twist 6, covariance 36."""
-    stamp, end = _header(data)
-    at = end + -end % 4
-    child_end = at + 4 + _LENGTH(data, at)[0]
-    n = _numbers(data, child_end, 85)
-    return OdometryPose(
-        stamp, source, texts[data[16:end]], texts[data[at + 4 : child_end]], n[:7], n[7:43], n[43:49], n[49:]
-    )
+def _odometry(data: bytes, source: str, names: _Names) -> OdometryPose:
+    """nav_msgs/msg/Odometry: pose 7, covariance 36, twist 6, covariance 36."""
+    stamp, (frame, child), n = _read(data, 85, names)
+    return OdometryPose(stamp, source, frame, child, n[:7], n[7:43], n[43:49], n[49:])
 
 
-def _pose_with_covariance(data: bytes, source: str, texts: _Texts) -> OdometryPose:
-    stamp, end = _header(data)
-    n = _numbers(data, end, 43)
-    return OdometryPose(stamp, source, texts[data[16:end]], "", n[:7], n[7:], STILL, UNKNOWN)
+def _pose_with_covariance(data: bytes, source: str, names: _Names) -> OdometryPose:
+    stamp, (frame,), n = _read(data, 43, names)
+    return OdometryPose(stamp, source, frame, "", n[:7], n[7:], STILL, UNKNOWN)
 
 
-def _pose(data: bytes, source: str, texts: _Texts) -> OdometryPose:
-    stamp, end = _header(data)
-    return OdometryPose(
-        stamp, source, texts[data[16:end]], "", _numbers(data, end, 7), UNKNOWN, STILL, UNKNOWN
-    )
+def _pose(data: bytes, source: str, names: _Names) -> OdometryPose:
+    stamp, (frame,), n = _read(data, 7, names)
+    return OdometryPose(stamp, source, frame, "", n, UNKNOWN, STILL, UNKNOWN)
 
 
-def _relative(data: bytes, source: str, texts: _Texts) -> RelativePose:
+def _relative(data: bytes, source: str, names: _Names) -> RelativePose:
     """nav_msgs/msg/Odometry whose frames name two moments."""
-    told = _odometry(data, source, texts)
+    told = _odometry(data, source, names)
     frame_i, stamp_i = parse_frame(told.frame)
     frame_j, stamp_j = parse_frame(told.child)
     if stamp_i is None or stamp_j is None:
@@ -101,11 +101,12 @@ def _relative(data: bytes, source: str, texts: _Texts) -> RelativePose:
     return RelativePose(stamp, source, stamp_i, stamp_j, frame_i, frame_j, told.pose, told.covariance)
 
 
-_FAST: Mapping[tuple[str, str], Callable[[bytes, str, _Texts], Measurement]] = {
-    ("odometry", "nav_msgs/msg/Odometry"): _odometry,
-    ("odometry", "geometry_msgs/msg/PoseWithCovarianceStamped"): _pose_with_covariance,
-    ("odometry", "geometry_msgs/msg/PoseStamped"): _pose,
-    ("relative", "nav_msgs/msg/Odometry"): _relative,
+_Fast = Callable[[bytes, str, _Names], Measurement]
+_FAST: Mapping[tuple[str, str], tuple[_Fast, int]] = {  # (kind, type) -> the short way, number of names
+    ("odometry", "nav_msgs/msg/Odometry"): (_odometry, 2),
+    ("odometry", "geometry_msgs/msg/PoseWithCovarianceStamped"): (_pose_with_covariance, 1),
+    ("odometry", "geometry_msgs/msg/PoseStamped"): (_pose, 1),
+    ("relative", "nav_msgs/msg/Odometry"): (_relative, 2),
 }
 
 
@@ -114,7 +115,8 @@ class _Route(NamedTuple):
 
     type: str
     source: str
-    fast: Callable[[bytes, str, _Texts], Measurement] | None
+    fast: _Fast | None
+    names: _Names
     slow: SensorDecoder | None
 
 
@@ -124,7 +126,6 @@ class Decoder:
     def __init__(self, typestore: Typestore, table: Mapping[str, tuple[str, str]]) -> None:
         self._typestore, self._table = typestore, table
         self._routes: dict[str, _Route] = {}
-        self._texts = _Texts()
 
     def decode(self, record: Record) -> tuple[Outcome, ...]:
         """What the record says: nothing if its topic is not in the table, one Decision if it cannot be understood."""
@@ -138,7 +139,7 @@ class Decoder:
         )  # views of it must stay read-only
         if route.fast is not None:
             try:
-                return (route.fast(data, route.source, self._texts),)
+                return (route.fast(data, route.source, route.names),)
             except (ValueError, struct.error):
                 pass
         return self._decode(record, data, route)
@@ -146,7 +147,8 @@ class Decoder:
     def _route(self, record: Record) -> _Route:
         source, kind = self._table[record.topic]
         slow = SENSORS[kind].decoders.get(record.type) if kind in SENSORS else None
-        route = _Route(record.type, source, _FAST.get((kind, record.type)) if slow else None, slow)
+        fast, count = _FAST.get((kind, record.type), (None, 0))
+        route = _Route(record.type, source, fast, _Names(count), slow)
         self._routes[record.topic] = route
         return route
 
