@@ -48,6 +48,9 @@ class Isam2(Section):
         0.1, gt=0, description="change of a variable (m, rad) that relinearizes it"
     )
     relinearize_skip: int = Field(10, ge=1, description="updates between two looks at that threshold")
+    wildfire_threshold: float = Field(
+        1e-4, ge=0, description="change (m, rad) below which an update is not carried on to older variables"
+    )
     extra_updates: int = Field(
         2,
         ge=0,

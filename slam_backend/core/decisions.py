@@ -8,9 +8,8 @@ from typing import Any
 from .graph import Decision
 from .measurement import SECOND, format_stamp
 
-ABOUT_RECORDS = frozenset(
-    {"decode", "check", "settle", "recheck"}
-)  # stages that a flood of bad messages can fill
+# stages that a flood of bad messages can fill
+ABOUT_RECORDS = frozenset({"decode", "check", "settle", "recheck", "landmark", "pose", "relative"})
 
 
 class DecisionLog:

@@ -57,7 +57,7 @@ class Isam2:
         return Believed(self._isam, self._space)
 
     def polish(self) -> Estimate:
-        values = self._isam.calculateEstimate()
+        values = self._isam.calculateBestEstimate()
         if values.size():
             isam, slots = self._settled(self.factors.values(), values)
             self._isam, self._slots = isam, slots
@@ -103,7 +103,7 @@ class Isam2:
 
     def _rebuild(self, delta: Delta) -> Estimate:
         """Apply a change that moves existing variables."""
-        values = self._isam.calculateEstimate()
+        values = self._isam.calculateBestEstimate()
         for key, value in delta.values.items():
             values.insert_or_assign(key, value)
         try:
@@ -166,7 +166,7 @@ class Isam2:
         for _ in range(ROUNDS):
             isam = self._empty()
             isam.update(graph, values)
-            found = isam.calculateEstimate()
+            found = isam.calculateBestEstimate()
             step = float(np.abs(values.localCoordinates(found).vector()).max())
             now = graph.error(found)
             if not (np.isfinite(step) and np.isfinite(now)):
@@ -208,6 +208,11 @@ class Isam2:
         params.setRelinearizeThreshold(self._config.relinearize_threshold)
         params.relinearizeSkip = self._config.relinearize_skip
         params.enablePartialRelinearizationCheck = True
+        # gtsam's own default of 1e-3 leaves each of thousands of poses a fraction of a millimetre behind, which
+        # against odometry of 2 mm per step is a cost of 1.2 times the optimum
+        descent = gtsam.ISAM2GaussNewtonParams()
+        descent.setWildfireThreshold(self._config.wildfire_threshold)
+        params.setOptimizationParams(descent)
         params.setFactorization("QR" if self._qr else "CHOLESKY")
         return gtsam.ISAM2(params)
 
@@ -228,7 +233,7 @@ class Believed:
         return bool(self._isam.valueExists(key))
 
     def values(self) -> gtsam.Values:
-        return self._isam.calculateEstimate()
+        return self._isam.calculateBestEstimate()  # a whole back-substitution: no wildfire threshold
 
     def covariance(self, keys: Sequence[int]) -> Array:
         try:
