@@ -15,7 +15,7 @@ import numpy as np
 
 from ..core.backend import Backend, Update
 from ..core.check import checked, rechecked
-from ..core.config import Config, config_hash
+from ..core.config import Config, config_from, config_hash, config_to
 from ..core.decisions import DecisionLog
 from ..core.errors import BadFile
 from ..core.fingerprint import run_hash
@@ -23,26 +23,30 @@ from ..core.graph import Decision, Factor
 from ..core.measurement import SECOND, Measurement
 from ..core.settle import settled
 from ..core.trajectory import Snapshot, Trajectory
+from .configfile import configured
 from .discover import discover
 from .inputs import BagInputs, GraphInput, open_inputs
 
 VERSIONS = ("slam_backend", "gtsam", "numpy", "rosbags")
 
 
-def replay(inputs: Path | str | Sequence[Path | str], config: Config | None = None) -> "Run":
+def replay(
+    inputs: Path | str | Sequence[Path | str], config: Config | None = None, settings: Sequence[str] = ()
+) -> "Run":
     """Replay bags, journals or a pose graph. Iterate the Run for its updates, or ask for its `result`.
 
-    config: None finds the sources by the types of the topics. SlamError says what is wrong with the input.
+    config: without one, or without sources in it, these are found by the types of the topics. settings: `key=value`, applied
+    to what was found. SlamError says what is wrong with the input.
     """
     paths = [inputs] if isinstance(inputs, Path | str) else list(inputs)
     opened = open_inputs(paths)
     notes: list[str] = []
     try:
-        if config is None:
-            config, notes = discover(opened)
-        elif not config.sources:
+        if config is None or not config.sources:
             found, notes = discover(opened)
-            config = config.model_copy(update={"sources": found.sources})
+            given = {} if config is None else config.model_dump(exclude_unset=True, exclude={"sources"})
+            config = config_from({**config_to(found), **given}, "configuration")
+        config = configured(config, settings)
         return Run(opened, config, notes)
     except BaseException:
         opened.close()
