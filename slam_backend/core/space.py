@@ -17,6 +17,8 @@ from .geometry import covariance_from_ros, seven_of_matrix
 from .graph import Pose
 from .measurement import Array
 
+ZENITH = 1e-3  # least change of direction per radian of azimuth, which has no effect straight up
+
 
 class Space(Protocol):
     name: str
@@ -274,9 +276,9 @@ class Spatial:
         """The covariance of the bearing is in the basis of the Unit3 that `observe` makes."""
         x, y, z = (float(v) for v in value)
         r = sqrt(x * x + y * y + z * z)
-        basis = gtsam.Unit3(np.asarray(value, dtype=np.float64)).basis()
-        jacobian = np.vstack([basis.T / r, np.array([[x, y, z]]) / r])
         polar = np.array([atan2(y, x), atan2(z, sqrt(x * x + y * y)), r])
+        basis = gtsam.Unit3(self.direction(polar[0], polar[1])).basis()  # rounding decides it: the very same vector
+        jacobian = np.vstack([basis.T / r, np.array([[x, y, z]]) / r])
         return polar, jacobian @ covariance @ jacobian.T
 
     def to_cartesian(self, value: Array, covariance: Array) -> tuple[Array, Array]:
@@ -296,10 +298,11 @@ class Spatial:
         return np.asarray(jacobian @ covariance @ jacobian.T)
 
     def _turns(self, value: Array) -> Array:
-        """(3, 2) derivative of the direction by azimuth and elevation."""
+        """(3, 2) derivative of the direction by azimuth and elevation; a covariance must stay definite at the zenith."""
         a, e = float(value[0]), float(value[1])
+        level = cos(e) if abs(cos(e)) > ZENITH else ZENITH
         return np.array(
-            [[-cos(e) * sin(a), -sin(e) * cos(a)], [cos(e) * cos(a), -sin(e) * sin(a)], [0.0, cos(e)]]
+            [[-level * sin(a), -sin(e) * cos(a)], [level * cos(a), -sin(e) * sin(a)], [0.0, cos(e)]]
         )
 
     def direction(self, azimuth: float, elevation: float) -> Array:
