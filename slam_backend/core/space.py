@@ -79,10 +79,6 @@ class Space(Protocol):
         """Unit vector; a plane ignores the second argument."""
         ...
 
-    def angles(self, point: Array) -> Array:
-        """The value of a bearing towards a point."""
-        ...
-
     def bearing_noise(self, value: Array, covariance: Array) -> Array:
         """A covariance of azimuth, [elevation, range] at the tangent of the native factor."""
         ...
@@ -179,9 +175,6 @@ class Planar:
     def direction(self, azimuth: float, elevation: float) -> Array:  # noqa: ARG002  # a plane has no elevation
         return np.array([cos(azimuth), sin(azimuth)])
 
-    def angles(self, point: Array) -> Array:
-        return np.array([atan2(point[1], point[0]), 0.0])
-
     def bearing_noise(self, value: Array, covariance: Array) -> Array:  # noqa: ARG002  # an angle is its own tangent
         return covariance
 
@@ -277,7 +270,8 @@ class Spatial:
         x, y, z = (float(v) for v in value)
         r = sqrt(x * x + y * y + z * z)
         polar = np.array([atan2(y, x), atan2(z, sqrt(x * x + y * y)), r])
-        basis = gtsam.Unit3(self.direction(polar[0], polar[1])).basis()  # rounding decides it: the very same vector
+        # Rounding can decide which basis a direction has: this is the very vector that `observe` uses.
+        basis = gtsam.Unit3(self.direction(polar[0], polar[1])).basis()
         jacobian = np.vstack([basis.T / r, np.array([[x, y, z]]) / r])
         return polar, jacobian @ covariance @ jacobian.T
 
@@ -285,10 +279,6 @@ class Spatial:
         direction = self.direction(value[0], value[1])
         jacobian = np.column_stack([self._turns(value) * value[2], direction])
         return direction * value[2], jacobian @ covariance @ jacobian.T
-
-    def angles(self, point: Array) -> Array:
-        x, y, z = (float(v) for v in point)
-        return np.array([atan2(y, x), atan2(z, sqrt(x * x + y * y))])
 
     def bearing_noise(self, value: Array, covariance: Array) -> Array:
         """In the basis of the Unit3 that `observe` makes."""

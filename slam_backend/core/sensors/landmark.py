@@ -158,20 +158,23 @@ def _bearing(
     config: LandmarkSource,
     points: dict[int, Array],
 ) -> Factor:
-    """A bearing of a landmark that has a position. From beside the keyframe it is carried over at the landmark's
-    present distance: the offset is short beside it, and there is no native bearing factor with an offset.
+    """A bearing of a landmark that has a position. From beside the keyframe it is carried over, noise and all, at the
+    landmark's present distance: the offset is short beside it, and there is no native bearing factor with an offset.
     """
     (value, covariance), space = seen, context.space
     m = offer.measurement
     assert isinstance(m, LandmarkObservation)
     key, pose_key = context.landmark(m.landmark), placed.keyframe.pose
-    noise = space.bearing_noise(value, covariance)
-    if mount is not space.identity or placed.motion is not None:
+    if mount is space.identity and placed.motion is None:
+        noise = space.bearing_noise(value, covariance)
+    else:
         sensor = placed.motion.pose.compose(mount) if placed.motion else mount
         point = points[key] if key in points else context.point(key)
         distance = float(np.linalg.norm(context.pose(pose_key).compose(sensor).transformTo(point)))
-        carried = sensor.transformFrom(space.direction(value[0], value[1]) * max(distance, 1e-3))
-        value = space.angles(carried)
+        exact = np.pad(covariance, (0, 1))  # the distance is a point to linearize at, not a measurement
+        polar = np.append(value, max(distance, 1e-3)), exact
+        value, noise, _ = _polar("bearing_range", polar, mount, placed.motion, space)
+        value, noise = value[:-1], noise[:-1, :-1]
     factor = space.observe_bearing(pose_key, key, value, noise_of(noise, config))
     return Factor(offer.id, "landmark", factor, (pose_key, key), offer.measurement.stamp)
 
