@@ -87,6 +87,14 @@ def each(window: Iterable[Offer], stage: str, make: Callable[[Offer], Factor | W
     return Delta(tuple(found), waits=tuple(waits), decisions=tuple(decisions))
 
 
+def pose_covariance(
+    space: Space, ros: Array, pose: Pose, sigma_rotation: float, sigma_translation: float
+) -> Array:
+    """(36,) in ROS order to the tangent of `pose`; zero variances take the defaults before the axes are turned."""
+    defaults = np.diag((sigma_translation**2,) * 3 + (sigma_rotation**2,) * 3)
+    return space.covariance(defaulted(ros.reshape(6, 6), defaults), pose)
+
+
 def defaulted(covariance: Array, defaults: Array) -> Array:
     """A covariance whose zero or NaN variances are replaced by the configured ones."""
     missing = ~(np.diag(covariance) > 0)

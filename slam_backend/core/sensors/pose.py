@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..config import PoseSource
-from ..context import Context, defaulted, each
+from ..context import Context, each, pose_covariance
 from ..graph import Delta, Factor, Keyframe, Motion, Offer
 from ..measurement import Array, Decoder, Measurement, Message, frozen, seven_of, stamp_of
 from ..robust.kernels import noise_of
@@ -47,9 +47,8 @@ def _factor(offer: Offer, context: Context, config: PoseSource) -> Factor:
     assert isinstance(m, AbsolutePose)
     placed, mount = context.landing(m.stamp), context.mount(m.frame)
     pose = space.pose(m.pose.tolist())
-    default = space.diagonal(config.sigma_rotation**2, config.sigma_translation**2)
-    absolute = Motion(pose, defaulted(space.covariance(m.covariance, pose), default))
-    absolute = absolute.then(Motion(mount.inverse(), np.zeros_like(default)))
+    covariance = pose_covariance(space, m.covariance, pose, config.sigma_rotation, config.sigma_translation)
+    absolute = Motion(pose, covariance).then(Motion(mount.inverse(), np.zeros_like(covariance)))
     if placed.motion is not None:
         absolute = absolute.then(placed.motion.inverse())
     key = placed.keyframe.pose

@@ -7,7 +7,7 @@ import gtsam
 import numpy as np
 
 from ..config import RelativeSource
-from ..context import Context, Unusable, defaulted, each
+from ..context import Context, Unusable, each, pose_covariance
 from ..errors import BadMessage
 from ..graph import Delta, Factor, Keyframe, Motion, Offer, Pose
 from ..measurement import (
@@ -145,11 +145,8 @@ def _measured(m: RelativePose, pose: Pose, context: Context, config: RelativeSou
     space = context.space
     if m.information is not None:
         return Motion(pose, np.asarray(np.linalg.inv(space.information(m.information))))
-    covariance = (
-        space.covariance(m.covariance, pose) if m.covariance.any() else np.zeros((space.dimension,) * 2)
-    )
     return Motion(
-        pose, defaulted(covariance, space.diagonal(config.sigma_rotation**2, config.sigma_translation**2))
+        pose, pose_covariance(space, m.covariance, pose, config.sigma_rotation, config.sigma_translation)
     )
 
 
