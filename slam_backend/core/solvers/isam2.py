@@ -8,17 +8,19 @@ are stored here, and after any failure the ISAM2 is dropped and rebuilt from the
     the same without the factors of the change that cannot be solved: SolverFailure names them
 
 Cholesky is about twice as fast as QR on graphs rich in loops, but throws on long open trajectories and on
-strongly anisotropic information; once it has thrown, QR serves for the rest of the run.
+strongly anisotropic information; once it has thrown for no single factor's fault, QR serves for the rest of the run.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from math import isfinite
+from typing import Any
 
 import gtsam
 import numpy as np
 
 from ..config import Config
 from ..errors import SolverFailure
-from ..graph import Decision, Delta, Estimate, Factor, Pose
+from ..graph import Decision, Delta, Estimate, Factor, Pose, is_pose
 from ..measurement import Array
 from ..space import Space
 
@@ -28,10 +30,16 @@ ROUNDS = 30  # of re-linearization in a rebuild
 JOINING = frozenset({"loop", "pose"})  # kinds of factors after which one update is not enough
 
 _Failures = (
-    RuntimeError,
-    IndexError,
-    ValueError,
-)  # what gtsam throws: indeterminate systems, missing keys, bad noise
+    Exception  # gtsam throws RuntimeError, IndexError, ValueError; a factor written in Python anything
+)
+
+Built = tuple[gtsam.ISAM2, dict[str, int]]  # and factor id -> iSAM2's index of it
+
+
+class Unsettled(
+    RuntimeError
+):  # never leaves this file: finite, but it moves on and on (a kernel between two minima)
+    pass
 
 
 class Isam2:
@@ -42,33 +50,39 @@ class Isam2:
         self._slots: dict[str, int] = {}  # factor id -> iSAM2's index of it
         self._incidents: list[Decision] = []
         self._isam = self._empty()
+        self._guesses: dict[int, Any] = {}  # of every variable: where to start when all else is lost
+        self._believed = Believed(self)
         self._force = gtsam.ISAM2UpdateParams()
         self._force.force_relinearize = True
 
     def update(self, delta: Delta) -> Estimate:
-        if any(self._isam.valueExists(key) for key in delta.values):
-            return self._rebuild(delta)  # variables that exist are moved: iSAM2 cannot do that
+        fresh = [key for key in delta.values if not self._isam.valueExists(key)]
         try:
-            self._apply(delta)
+            if len(fresh) < len(delta.values):
+                self._move(delta)  # variables that exist are moved: iSAM2 cannot do that
+            else:
+                self._apply(delta)
             self._check(delta)
         except _Failures as error:
-            return self._recover(delta, error)
+            self._recover(delta, fresh, error)
         self._commit(delta)
-        return Believed(self._isam, self._space)
+        return self._believed
 
     def polish(self) -> Estimate:
         values = self._isam.calculateBestEstimate()
         if values.size():
-            isam, slots = self._settled(self.factors.values(), values)
-            self._isam, self._slots = isam, slots
-        return Believed(self._isam, self._space)
+            try:
+                self._isam, self._slots = self._settled(self.factors.values(), values)
+            except _Failures as error:
+                self._note("unpolished", error, 0)
+        return self._believed
 
     def incidents(self) -> tuple[Decision, ...]:
         told, self._incidents = tuple(self._incidents), []
         return told
 
     def _apply(self, delta: Delta) -> None:
-        graph, values = _gather(delta.add, delta.values)
+        graph, values = _graph(delta.add), _values(delta.values)
         first = self._isam.getFactorsUnsafe().size()
         if delta.remove:
             self._isam.update(graph, values, [self._slots[id_] for id_ in delta.remove])
@@ -83,103 +97,100 @@ class Isam2:
                     break
 
     def _check(self, delta: Delta) -> None:
-        """Garbage without a throw: the newest variables of the change must be finite."""
-        estimate = Believed(self._isam, self._space)
-        for key, value in delta.values.items():
+        """Garbage without a throw: what the change adds or joins must be finite."""
+        joined = (key for factor in delta.add if factor.kind in JOINING for key in factor.keys)
+        for key in {**delta.values, **dict.fromkeys(joined)}:
             found = (
-                estimate.point(key)
-                if isinstance(value, np.ndarray)
-                else self._space.numbers(estimate.pose(key))
+                self._space.numbers(self._believed.pose(key)) if is_pose(key) else self._believed.point(key)
             )
-            if not np.isfinite(found).all():
+            if not all(map(isfinite, found)):
                 raise RuntimeError(f"estimate is not finite near variable {gtsam.DefaultKeyFormatter(key)}")
 
     def _commit(self, delta: Delta) -> None:
         for id_ in delta.remove:
-            del self.factors[id_]
+            self.factors.pop(id_, None)
             self._slots.pop(id_, None)
         for factor in delta.add:
             self.factors[factor.id] = factor
+        self._guesses.update(delta.values)
 
-    def _rebuild(self, delta: Delta) -> Estimate:
-        """Apply a change that moves existing variables."""
+    def _move(self, delta: Delta) -> None:
         values = self._isam.calculateBestEstimate()
         for key, value in delta.values.items():
             values.insert_or_assign(key, value)
-        try:
-            self._isam, self._slots = self._settled(self._after(delta), values)
-        except _Failures as error:
-            return self._recover(delta, error)
-        self._commit(delta)
-        return Believed(self._isam, self._space)
+        self._isam, self._slots = self._settled(self._after(delta), values)
 
-    def _recover(self, delta: Delta, error: Exception) -> Estimate:
+    def _recover(self, delta: Delta, fresh: Sequence[int], error: Exception) -> None:
         """Rebuild with the change, on a stronger rung; or without it, and say which factors are guilty."""
-        start = _finite(self._isam.getLinearizationPoint(), self._space)
-        values = gtsam.Values(start)
+        before, qr = self._refuge(fresh), self._qr
+        values = gtsam.Values(before)
         for key, value in delta.values.items():
             values.insert_or_assign(key, value)
-        before = gtsam.Values(start)
-        for key in delta.values:
-            if before.exists(key):
-                before.erase(key)
-        guilty = self._broken(delta, values)
+        guilty = tuple(factor.id for factor in delta.add if not _linearizes(factor, values))
         if not guilty:
+            self._qr = qr or self._config.factorization == "auto"
             try:
                 self._isam, self._slots = self._climb(list(self._after(delta)), values)
             except _Failures:
                 guilty = self._unsolvable(delta, before)
             else:
-                self._commit(delta)
-                self._note("rebuilt", error, "")
-                return Believed(self._isam, self._space)
-        self._isam, self._slots = (
-            self._climb(list(self.factors.values()), before) if self.factors else (self._empty(), {})
-        )
-        self._note("rolled_back", error, f"; without {', '.join(guilty)}")
+                self._note("rebuilt", error, _stamp(delta))
+                return
+        self._qr = qr
+        self._isam, self._slots = self._climb(list(self.factors.values()), before)
+        self._note("rolled_back", error, _stamp(delta), f"; without {', '.join(guilty)}")
         raise SolverFailure(_short(error), guilty) from None
+
+    def _refuge(self, fresh: Iterable[int]) -> gtsam.Values:
+        """Where to start a rebuild: iSAM2's linearization point without new variables; first guesses if that is lost."""
+        values = gtsam.Values(self._isam.getLinearizationPoint())
+        for key in fresh:
+            if values.exists(key):
+                values.erase(key)
+        if values.size() and not np.isfinite(values.localCoordinates(values).vector()).all():
+            return _values(self._guesses)
+        return values
 
     def _after(self, delta: Delta) -> Iterable[Factor]:
         gone = set(delta.remove)
         yield from (factor for factor in self.factors.values() if factor.id not in gone)
         yield from delta.add
 
-    def _climb(self, factors: Sequence[Factor], values: gtsam.Values) -> tuple[gtsam.ISAM2, dict[str, int]]:
-        """QR; then batch Levenberg-Marquardt and QR from there. Raises what the last rung raised."""
-        self._qr = self._qr or self._config.factorization == "auto"
+    def _climb(self, factors: Sequence[Factor], values: gtsam.Values) -> Built:
+        """Gauss-Newton; then batch Levenberg-Marquardt and whatever is near its optimum. Raises what the last rung raised."""
         try:
             return self._settled(factors, values)
         except _Failures:
-            graph, start = _gather(factors, {})[0], values
-            found = gtsam.LevenbergMarquardtOptimizer(
-                graph, start, gtsam.LevenbergMarquardtParams()
-            ).optimize()
-            return self._settled(factors, found)
+            params = gtsam.LevenbergMarquardtParams()
+            found = gtsam.LevenbergMarquardtOptimizer(_graph(factors), values, params).optimize()
+            try:
+                return self._settled(factors, found)
+            except Unsettled:
+                return self._built(factors, found)
 
-    def _settled(self, factors: Iterable[Factor], values: gtsam.Values) -> tuple[gtsam.ISAM2, dict[str, int]]:
+    def _settled(self, factors: Iterable[Factor], values: gtsam.Values) -> Built:
         """A new ISAM2 with fresh linearization points, renewed until the largest step is below SETTLED."""
-        graph, slots = gtsam.NonlinearFactorGraph(), {}
-        for i, factor in enumerate(factors):
-            graph.add(factor.factor)
-            slots[factor.id] = i
-        error = np.inf
-        for _ in range(ROUNDS):
-            isam = self._empty()
-            isam.update(graph, values)
+        factors = list(factors)
+        graph, error = _graph(factors), np.inf
+        for _ in range(ROUNDS if factors else 0):
+            isam, slots = self._built(factors, values)
             found = isam.calculateBestEstimate()
             step = float(np.abs(values.localCoordinates(found).vector()).max())
             now = graph.error(found)
-            if not (np.isfinite(step) and np.isfinite(now)):
+            if not (isfinite(step) and isfinite(now)):
                 raise RuntimeError("the rebuilt estimate is not finite")
             values = found
             if step < SETTLED or abs(error - now) <= ROUNDING * now:
                 return isam, slots
             error = now
-        raise RuntimeError("the rebuilt estimate does not settle")
+        if not factors:
+            return self._empty(), {}
+        raise Unsettled("the rebuilt estimate does not settle")
 
-    def _broken(self, delta: Delta, values: gtsam.Values) -> tuple[str, ...]:
-        """Factors of the change that cannot even be linearized to finite numbers."""
-        return tuple(factor.id for factor in delta.add if not _linearizes(factor, values))
+    def _built(self, factors: Sequence[Factor], values: gtsam.Values) -> Built:
+        isam = self._empty()
+        isam.update(_graph(factors), values)
+        return isam, {factor.id: i for i, factor in enumerate(factors)}
 
     def _unsolvable(self, delta: Delta, before: gtsam.Values) -> tuple[str, ...]:
         """Factors of the change that cannot be solved one after the other, motion first."""
@@ -198,9 +209,9 @@ class Isam2:
                 values = trial
         return tuple(guilty) or tuple(factor.id for factor in delta.add)
 
-    def _note(self, reason: str, error: Exception, more: str) -> None:
+    def _note(self, reason: str, error: Exception, stamp: int, more: str = "") -> None:
         self._incidents.append(
-            Decision(0, f"solver/{reason}", "solver", "restored", "solver", reason, _short(error) + more)
+            Decision(stamp, f"solver/{reason}", "solver", "restored", "solver", reason, _short(error) + more)
         )
 
     def _empty(self) -> gtsam.ISAM2:
@@ -218,16 +229,20 @@ class Isam2:
 
 
 class Believed:
-    """The estimate of one ISAM2; valid until its next update. Implements graph.Estimate."""
+    """What an Isam2 believes at the moment of asking, failures survived. Implements graph.Estimate."""
 
-    def __init__(self, isam: gtsam.ISAM2, space: Space) -> None:
-        self._isam, self._space = isam, space
+    def __init__(self, solver: Isam2) -> None:
+        self._solver = solver
+
+    @property
+    def _isam(self) -> gtsam.ISAM2:
+        return self._solver._isam  # noqa: SLF001  # one thing in two classes
 
     def pose(self, key: int) -> Pose:
-        return self._space.estimate(self._isam, key)
+        return self._solver._space.estimate(self._isam, key)  # noqa: SLF001
 
     def point(self, key: int) -> Array:
-        return self._space.estimate_point(self._isam, key)
+        return self._solver._space.estimate_point(self._isam, key)  # noqa: SLF001
 
     def knows(self, key: int) -> bool:
         return bool(self._isam.valueExists(key))
@@ -245,22 +260,22 @@ class Believed:
         return np.block([[joint.at(i, j) for j in keys] for i in keys])
 
 
-def _gather(factors: Iterable[Factor], values: object) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
-    graph, first = gtsam.NonlinearFactorGraph(), gtsam.Values()
+def _graph(factors: Iterable[Factor]) -> gtsam.NonlinearFactorGraph:
+    graph = gtsam.NonlinearFactorGraph()
     for factor in factors:
         graph.add(factor.factor)
-    assert isinstance(values, dict)
-    for key, value in values.items():
-        first.insert(key, value)
-    return graph, first
+    return graph
 
 
-def _finite(values: gtsam.Values, space: Space) -> gtsam.Values:
-    """A copy; raises SolverFailure when even the linearization point is lost."""
-    copy = gtsam.Values(values)
-    if copy.size() and not np.isfinite(np.abs(copy.localCoordinates(copy).vector())).all():
-        raise SolverFailure(f"the {space.name} linearization point is not finite", ())
-    return copy
+def _values(guesses: Mapping[int, Any]) -> gtsam.Values:
+    values = gtsam.Values()
+    for key, value in guesses.items():
+        values.insert(key, value)
+    return values
+
+
+def _stamp(delta: Delta) -> int:
+    return max((factor.stamp for factor in delta.add), default=0)
 
 
 def _linearizes(factor: Factor, values: gtsam.Values) -> bool:
