@@ -27,7 +27,8 @@ class Track:
 
     Noise over a stretch, by `OdometrySource.noise`:
         model  variances that grow with the distance and the angle between its ends, and a floor
-        twist  each message's twist covariance held over the time since the last, as independent errors
+        twist  each message's twist covariance held over the time since the last, as independent errors; the model's
+               growth on axes whose variance is zero
         pose   the pose covariance at the end minus that at the start, seen from the end; the model where
                the difference is not positive definite (covariances that shrink or stand still)
     """
@@ -47,6 +48,9 @@ class Track:
         at = len(self._stamps)
         if at and stamp < self._stamps[-1]:
             at = bisect_left(self._stamps, stamp)
+        if at and covariance is not None and self._noise.noise == "twist":
+            covariance = self._filled(covariance, self._sample(at - 1).between(pose))
+        self._protected += at <= self._protected < len(self._stamps)
         self._stamps.insert(at, stamp)
         self._numbers.insert(at, self._space.numbers(pose))
         if covariance is not None:
@@ -94,30 +98,31 @@ class Track:
             grown = self._of_poses(start, end, motion)
             if grown is not None:
                 return self._floor() + grown
-        return self._of_model(motion)
+        return self._floor() + self._growth(motion)
 
     def _floor(self) -> Array:
         noise = self._noise
         return self._space.diagonal(noise.sigma_rotation_floor**2, noise.sigma_translation_floor**2)
 
-    def _of_model(self, motion: Pose) -> Array:
+    def _growth(self, motion: Pose) -> Array:
         noise = self._noise
         meters, radians = self._space.size(motion)
         return self._space.diagonal(
-            noise.sigma_rotation_per_meter**2 * meters
-            + noise.sigma_rotation_per_radian**2 * radians
-            + noise.sigma_rotation_floor**2,
-            noise.sigma_translation_per_meter**2 * meters
-            + noise.sigma_translation_per_radian**2 * radians
-            + noise.sigma_translation_floor**2,
+            noise.sigma_rotation_per_meter**2 * meters + noise.sigma_rotation_per_radian**2 * radians,
+            noise.sigma_translation_per_meter**2 * meters + noise.sigma_translation_per_radian**2 * radians,
         )
+
+    def _filled(self, step: Array, motion: Pose) -> Array:
+        """The covariance of a step with the model's growth where a variance is zero."""
+        unknown = np.diag(step) <= 0
+        return step + np.diag(unknown * np.diag(self._growth(motion))) if unknown.any() else step
 
     def _of_twists(self, start: int, end: int, last: Pose) -> Array:
         total = np.zeros((self._space.dimension,) * 2)
         for i in range(max(bisect_right(self._stamps, start), 1), bisect_left(self._stamps, end) + 1):
             before, after = self._stamps[i - 1], self._stamps[i]
             share = (min(after, end) - max(before, start)) / (after - before)
-            if after >= end:
+            if after == end:
                 total += share * self._covariances[i]
             else:
                 adjoint = last.between(self._sample(i)).AdjointMap()
