@@ -6,7 +6,7 @@ Only what the configuration uses is judged: the axes of the space, and covarianc
 
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
-from math import isfinite, sqrt
+from math import dist, isfinite
 from typing import Any
 
 import numpy as np
@@ -14,7 +14,7 @@ import numpy as np
 from .config import Config
 from .geometry import covariance_from_ros, covariance_to_ros, inverse_of, matrix_of, seven_of_matrix
 from .graph import Decision, Verdict
-from .measurement import SECOND, Array, Measurement, format_stamp, frozen
+from .measurement import SECOND, Array, Measurement, StaticTransform, format_stamp, frozen
 from .sensors.landmark import LandmarkObservation, vertical
 from .sensors.odometry import OdometryPose
 from .sensors.pose import AbsolutePose
@@ -48,18 +48,14 @@ def checked(items: Stream, config: Config) -> Iterator[Measurement | Decision]:
             yield item
             continue
         try:
-            zero = rule(item, space, config.sources[item.source])
+            zero = rule(item, space, config.sources.get(item.source))
         except Fault as fault:
             yield _decide(item, "refused", "check", fault)
             continue
         if zero and item.source not in defaulted:
             defaulted.add(item.source)
-            yield _decide(
-                item,
-                "accepted",
-                "check",
-                Fault("zero_covariance", "a variance of zero takes the configured default"),
-            )
+            why = Fault("zero_covariance", "a variance of zero takes the configured default")
+            yield replace(_decide(item, "accepted", "check", why), ends=None)  # of the source, not of a loop
         yield item
 
 
@@ -73,7 +69,7 @@ def rechecked(items: Stream, config: Config) -> Iterator[Measurement | Decision]
     for item in items:
         if isinstance(item, OdometryPose):
             source: Any = config.sources[item.source]
-            track = tracks.setdefault(item.source, _Continuity(source.max_speed))
+            track = tracks.setdefault(item.source, _Continuity(source.max_speed, SPACES[config.space]))
             yield from track.judge(item)
         else:
             yield item
@@ -84,20 +80,24 @@ def rechecked(items: Stream, config: Config) -> Iterator[Measurement | Decision]
 class _Continuity:
     """Of one odometry source: the last message believed, and a doubtful one that waits for the next."""
 
-    def __init__(self, max_speed: float) -> None:
-        self._max_speed = max_speed
+    def __init__(self, max_speed: float, space: Space) -> None:
+        self._max_speed, self._space = max_speed, space
+        self._unused = [axis for axis in range(6) if axis not in space.used]
         self._last: OdometryPose | None = None
         self._doubt: OdometryPose | None = None
         self._shift: Array | None = None  # (4, 4), old frame from new frame
 
     def judge(self, item: OdometryPose) -> Iterator[Measurement | Decision]:
         last, doubt = self._last, self._doubt
+        duplicate = Fault("duplicate", "a second message with this stamp")
         if last is not None and item.stamp <= last.stamp:
-            yield _decide(item, "refused", "recheck", Fault("duplicate", "a second message with this stamp"))
+            yield _decide(item, "refused", "recheck", duplicate)
         elif last is None or self._speeding(last, item) is None:
             yield from self.drop_doubt()
             self._last = item
             yield self._shifted(item)
+        elif doubt is not None and item.stamp == doubt.stamp:  # no witness: it may be the same message again
+            yield _decide(item, "refused", "recheck", duplicate)
         elif doubt is None or self._speeding(doubt, item) is not None:
             yield from self.drop_doubt()
             self._doubt = item
@@ -106,7 +106,7 @@ class _Continuity:
                 "restart", "the odometry jumped and stayed there", self._speeding(last, item), self._max_speed
             )
             yield _decide(item, "accepted", "recheck", why)
-            self._shift = matrix_of(self._shifted(last).pose) @ inverse_of(matrix_of(doubt.pose))
+            self._shift = self._matrix(self._shifted(last)) @ inverse_of(self._matrix(doubt))
             self._last, self._doubt = item, None
             yield self._shifted(doubt)
             yield self._shifted(item)
@@ -120,24 +120,33 @@ class _Continuity:
 
     def _speeding(self, last: OdometryPose, item: OdometryPose) -> float | None:
         """The speed in m/s between two messages where it exceeds the bound."""
-        ax, ay, az = last.pose[:3].tolist()
-        bx, by, bz = item.pose[:3].tolist()
-        meters = sqrt((bx - ax) ** 2 + (by - ay) ** 2 + (bz - az) ** 2)
+        n = self._space.point_dimension
+        meters = dist(last.pose[:n].tolist(), item.pose[:n].tolist())
         seconds = max((item.stamp - last.stamp) / SECOND, 1e-9)
         return meters / seconds if meters > self._max_speed * seconds + JITTER else None
 
     def _shifted(self, item: OdometryPose) -> OdometryPose:
         if self._shift is None:
             return item
-        before, after = matrix_of(item.pose), self._shift @ matrix_of(item.pose)
-        at_child = covariance_from_ros(item.covariance.reshape(6, 6), before[:3, :3])
+        before = self._matrix(item)
+        after = self._shift @ before
+        covariance = item.covariance.reshape(6, 6).copy()
+        covariance[self._unused] = covariance[:, self._unused] = 0.0
+        at_child = covariance_from_ros(covariance, before[:3, :3])
         covariance = covariance_to_ros(at_child, after[:3, :3]).reshape(36)
         return replace(item, pose=frozen(seven_of_matrix(after)), covariance=frozen(covariance))
+
+    def _matrix(self, item: OdometryPose) -> Array:
+        """(4, 4); what stands on axes that do not count, be it NaN, must not spread to those that do."""
+        matrix = matrix_of(item.pose)
+        if 2 in self._unused:
+            matrix[2, 3] = 0.0
+        return matrix
 
 
 def _odometry(item: OdometryPose, space: Space, source: Any) -> bool:
     _stamp(item)
-    _pose(item.pose)
+    _pose(item.pose, space)
     if source.noise == "twist":
         return _covariance(item.twist_covariance, space)
     if source.noise == "pose":
@@ -147,7 +156,7 @@ def _odometry(item: OdometryPose, space: Space, source: Any) -> bool:
 
 def _relative(item: RelativePose, space: Space, source: Any) -> bool:  # noqa: ARG001  # one signature for the table
     _stamp(item)
-    _pose(item.pose)
+    _pose(item.pose, space)
     if item.stamp_i <= 0 or item.stamp_j <= 0:
         raise Fault("zero_stamp", "one of its two stamps is zero")
     if item.information is not None:
@@ -156,27 +165,33 @@ def _relative(item: RelativePose, space: Space, source: Any) -> bool:  # noqa: A
     return _covariance(item.covariance, space)
 
 
+def _static(item: StaticTransform, space: Space, source: Any) -> bool:  # noqa: ARG001
+    _pose(item.pose, space)  # its stamp says nothing, and is often zero
+    return False
+
+
 def _absolute(item: AbsolutePose, space: Space, source: Any) -> bool:  # noqa: ARG001
     _stamp(item)
-    _pose(item.pose)
+    _pose(item.pose, space)
     return _covariance(item.covariance, space)
 
 
 def _landmark(item: LandmarkObservation, space: Space, source: Any) -> bool:  # noqa: ARG001
     _stamp(item)
-    if not all(isfinite(v) and abs(v) < FARTHEST for v in item.value.tolist()):
+    size = len(item.covariance)
+    keep = [k for k in range(size) if space.name == "3d" or k != vertical(item.form)]
+    if not all(isfinite(v) and abs(v) < FARTHEST for v in item.value[keep].tolist()):
         raise Fault("not_finite", "the observation holds NaN, infinity or more than 1e9")
     if item.form == "bearing_range" and item.value[-1] <= 0:
         raise Fault("range", "the range is not positive", float(item.value[-1]), 0.0)
     if item.form == "position" and not np.any(item.value[: space.point_dimension]):
         raise Fault("range", "the landmark is where the sensor is", 0.0, 0.0)
-    size = len(item.covariance)
-    keep = [k for k in range(size) if space.name == "3d" or k != vertical(item.form)]
     block = item.covariance[np.ix_(keep, keep)]
     diagonal = np.diag(block)
     if np.isnan(diagonal).all() or not diagonal.any():
         return False  # no noise stated: the configured default
-    _judge(np.where(np.isnan(block) & np.isnan(diagonal)[:, None], 0.0, block))
+    unknown = np.isnan(diagonal)
+    _judge(np.where(np.isnan(block) & (unknown[:, None] | unknown), 0.0, block))
     return bool((diagonal == 0).any())
 
 
@@ -185,8 +200,10 @@ def _stamp(item: Measurement) -> None:
         raise Fault("zero_stamp", "the header has no stamp", float(item.stamp), 0.0)
 
 
-def _pose(seven: Array) -> None:
+def _pose(seven: Array, space: Space) -> None:
     x, y, z, qx, qy, qz, qw = seven.tolist()
+    if space.name == "2d":
+        z = 0.0
     square = qx * qx + qy * qy + qz * qz + qw * qw
     total = x + y + z + square
     if not isfinite(total) or max(abs(x), abs(y), abs(z)) > FARTHEST:
@@ -250,4 +267,5 @@ RULES: dict[type, Callable[[Any, Space, Any], bool]] = {
     RelativePose: _relative,
     AbsolutePose: _absolute,
     LandmarkObservation: _landmark,
+    StaticTransform: _static,
 }
