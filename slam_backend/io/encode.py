@@ -83,10 +83,23 @@ def encode_pose_with_covariance(stamp: int, frame: str, seven: ArrayLike, covari
 def encode_transform(stamp: int, frame: str, child: str, seven: ArrayLike) -> bytes:
     """geometry_msgs/msg/TransformStamped: the pose of `child` in `frame`."""
     message = _Bytes()
+    _transform(message, stamp, frame, child, seven)
+    return message.finish()
+
+
+def encode_transforms(stamp: int, frame: str, children: Mapping[str, ArrayLike]) -> bytes:
+    """tf2_msgs/msg/TFMessage: the poses (7,) of the children in `frame`."""
+    message = _Bytes()
+    message.integer(len(children))
+    for child, seven in children.items():
+        _transform(message, stamp, frame, child, seven)
+    return message.finish()
+
+
+def _transform(message: _Bytes, stamp: int, frame: str, child: str, seven: ArrayLike) -> None:
     message.header(stamp, frame)
     message.text(child)
     message.doubles(seven, 7)
-    return message.finish()
 
 
 def encode_path(frame: str, stamp: int, stamps: ArrayLike, sevens: ArrayLike) -> bytes:

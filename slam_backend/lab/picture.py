@@ -43,7 +43,7 @@ def draw(result: Result, path: Path) -> None:
             panel.set_aspect("equal", adjustable="box" if panel is right else "datalim")
             panel.set(xlabel=f"{names[0]} (m)", ylabel=f"{names[1]} (m)")
             panel.grid(alpha=0.3, linewidth=0.5)
-            panel.legend(loc="best", fontsize=9)
+            panel.legend(loc="upper center", bbox_to_anchor=(0.5, -0.08), ncols=6, fontsize=9, frameon=False)
     figure.suptitle(_title(result), fontsize=11)
     figure.tight_layout()
     figure.savefig(path, dpi=110)

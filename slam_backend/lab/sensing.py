@@ -15,6 +15,7 @@ from .options import Options
 from .world import chain, exp_of
 
 BASE = "base"
+CAMERA = "camera"  # the frame of the sensor that sees landmarks
 LOOP_AFTER = 50  # messages: what was seen more recently is motion, not a return
 LANDMARKS_EVERY = 5  # odometry messages
 HALF_VIEW = np.pi / 3  # rad, of a camera to either side
@@ -120,7 +121,7 @@ def sightings(
     truth: Array, landmarks: Array, camera: Array | None, stamps: list[int], options: Options, rng: Generator
 ) -> Iterator[tuple[LandmarkObservation, ...]]:
     """All landmarks in range and view of the (4, 4) camera in the base, or all around the base, at every fifth pose."""
-    frame = BASE if camera is None else "camera"
+    frame = BASE if camera is None else CAMERA
     sensors = truth[::LANDMARKS_EVERY] @ (np.eye(4) if camera is None else camera)
     covariance = frozen(np.eye(3) * options.landmark_sigma**2)
     for stamp, sensor in zip(stamps[::LANDMARKS_EVERY], sensors, strict=True):

@@ -18,7 +18,7 @@ from ..core.measurement import SECOND, Array, Measurement, format_stamp, frozen
 from ..core.sensors.odometry import STILL, UNKNOWN, OdometryPose
 from ..core.sensors.relative import RelativePose
 from ..io.bags import write_bag
-from ..io.encode import encode_cloud, encode_odometry
+from ..io.encode import encode_cloud, encode_odometry, encode_transforms
 from ..io.formats import tum
 from ..io.formats.trajectory import Trajectory
 from ..io.records import Record
@@ -57,8 +57,13 @@ class Simulation:
 
     @property
     def records(self) -> Iterator[Record]:
-        """What the bag holds, log times strictly increasing."""
-        return map(_record, self.sent)
+        """What the bag holds, log times strictly increasing; /tf_static first where there is a camera."""
+        camera = SCENARIOS[self.scenario].camera
+        if camera is not None:
+            mounts = {sensing.CAMERA: seven_of_matrix(_mounted(camera))}
+            data = encode_transforms(START, sensing.BASE, mounts)
+            yield Record("/tf_static", "tf2_msgs/msg/TFMessage", START - SECOND // 1000, data)
+        yield from map(_record, self.sent)
 
     @property
     def measurements(self) -> Iterator[Measurement]:
@@ -156,7 +161,7 @@ def _settings(world: Scenario, options: Options, topics: set[str]) -> dict[str, 
         "landmarks": {"kind": "landmark", "topic": "/landmarks", "sigma_position": options.landmark_sigma},
     }
     present = {name: source for name, source in sources.items() if source["topic"] in topics}
-    extrinsics = {} if world.camera is None else {"extrinsics": {"camera": list(world.camera)}}
+    extrinsics = {} if world.camera is None else {"extrinsics": {sensing.CAMERA: list(world.camera)}}
     head = {"space": world.space, "base_frame": sensing.BASE, "keyframes": {"every": True}}
     settings = {**head, **extrinsics, "sources": list(present), **present}
     config_from(settings)  # options that no configuration can say are refused here, not at the replay

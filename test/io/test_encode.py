@@ -12,6 +12,7 @@ from slam_backend.io.encode import (
     encode_path,
     encode_pose_with_covariance,
     encode_transform,
+    encode_transforms,
 )
 
 STORE = get_typestore(Stores.ROS2_JAZZY)
@@ -86,6 +87,8 @@ def test_transform(frame, child) -> None:
         transform=transform,
     )
     assert encode_transform(STAMP, frame, child, n) == theirs(message)
+    alone = make("tf2_msgs/msg/TFMessage", transforms=[message])
+    assert encode_transforms(STAMP, frame, {child: n}) == theirs(alone)
 
 
 @pytest.mark.parametrize("count", [0, 1, 2, 5])
