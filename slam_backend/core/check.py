@@ -133,8 +133,8 @@ class _Continuity:
         covariance = item.covariance.reshape(6, 6).copy()
         covariance[self._unused] = covariance[:, self._unused] = 0.0
         at_child = covariance_from_ros(covariance, before[:3, :3])
-        covariance = covariance_to_ros(at_child, after[:3, :3]).reshape(36)
-        return replace(item, pose=frozen(seven_of_matrix(after)), covariance=frozen(covariance))
+        turned = covariance_to_ros(at_child, after[:3, :3])
+        return replace(item, pose=frozen(seven_of_matrix(after)), covariance=frozen(turned.reshape(36)))
 
     def _matrix(self, item: OdometryPose) -> Array:
         """(4, 4); what stands on axes that do not count, be it NaN, must not spread to those that do."""
