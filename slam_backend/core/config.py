@@ -163,6 +163,8 @@ class Config(Section):
         for name in self.sources:
             if not name or "/" in name or "@" in name:
                 raise ValueError(f"source name '{name}' must not be empty or contain '/' or '@'")
+            if name in Config.model_fields or name == "gauge":
+                raise ValueError(f"a source cannot be called '{name}': that name has a meaning of its own")
         if self.sources and self.driver is None:
             raise ValueError("no source drives the keyframes: add one of kind odometry or relative")
         return self
@@ -185,14 +187,17 @@ def config_from(data: Mapping[str, Any], origin: str = "config") -> Config:
     if (
         len(data) == 1
         and isinstance(inner := next(iter(data.values())), Mapping)
-        and "ros__parameters" in inner
+        and isinstance(inner.get("ros__parameters"), Mapping)
     ):
         data = inner["ros__parameters"]
     flat = dict(data)
     listed = flat.get("sources", [])
     if isinstance(listed, (list, tuple)):
-        missing = [name for name in listed if name not in flat]
-        if missing:
+        if wrong := [name for name in listed if not isinstance(name, str)]:
+            raise BadConfig(
+                f"{origin}: 'sources' is a list of names, each described below it; it holds {wrong[0]!r}"
+            )
+        if missing := [name for name in listed if name not in flat]:
             raise BadConfig(
                 f"{origin}: source '{missing[0]}' is listed in 'sources' but not described: add '{missing[0]}: {{kind: ...}}'"
             )
@@ -216,7 +221,10 @@ def config_hash(config: Config) -> str:
 
 def _first_line(error: ValidationError) -> str:
     first = error.errors(include_url=False)[0]
-    where = ".".join(str(part) for part in first["loc"] if part != "sources") or "the file"
+    parts = [str(part) for part in first["loc"]]
+    if parts[:1] == ["sources"]:
+        parts = [*parts[1:2], *parts[3:]]  # as in the file: without 'sources' and the kind
+    where = ".".join(parts) or "the file"
     what = first["msg"].removeprefix("Value error, ")
     if first["type"] == "extra_forbidden":
         what = f"there is no such setting{_suggest(first['loc'])}"
