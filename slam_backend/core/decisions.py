@@ -48,7 +48,10 @@ class DecisionLog:
 
     def loops(self) -> dict[str, int]:
         """Verdict -> number of relative measurements for which it is the last one."""
-        last = {d.id: d for d in self._kept if d.ends is not None}
+        last: dict[Any, Decision] = {}
+        for d in self._kept:
+            if d.ends is not None:  # one about a record stands for all of its second, whatever id it has
+                last[(d.id, d.reason) if d.stage in ABOUT_RECORDS else d.id] = d
         counts: Counter[str] = Counter()
         for decision in last.values():
             counts[decision.verdict] += decision.count
