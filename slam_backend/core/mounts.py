@@ -8,11 +8,11 @@ from .space import Space
 
 
 class Mounts:
-    """Frames by name. The configuration wins over /tf_static; '', 'base' and the base frame are the base itself."""
+    """Frames by name. The configuration wins over /tf_static, for what hangs below its frames too; '', 'base' and the base frame are the base itself."""
 
     def __init__(self, space: Space, base: str, extrinsics: Mapping[str, Sequence[float]]) -> None:
-        self._space, self._base = space, base
-        self._given = {frame: space.from_extrinsics(six) for frame, six in extrinsics.items()}
+        self._space, self._base = space, base.lstrip("/")
+        self._given = {frame.lstrip("/"): space.from_extrinsics(six) for frame, six in extrinsics.items()}
         self._parents: dict[str, tuple[str, Pose]] = {}
         self._found: dict[str, Pose] = {}
 
@@ -46,6 +46,8 @@ class Mounts:
         above_base = self._ancestors(self._base)
         above_frame = self._ancestors(frame)
         for ancestor, ancestor_T_frame in above_frame.items():
+            if ancestor in self._given:
+                return self._given[ancestor].compose(ancestor_T_frame)
             if ancestor in above_base:
                 return above_base[ancestor].inverse().compose(ancestor_T_frame)
         return None
