@@ -32,6 +32,8 @@ class Trajectory:
         Rows of NaN outside the trajectory.
         """
         wanted = np.asarray(stamps, dtype=np.int64)
+        if not len(self):
+            return np.full((len(wanted), 7), np.nan)
         right = np.clip(np.searchsorted(self.stamps, wanted), 1, max(len(self.stamps) - 1, 1))
         left = right - 1
         if len(self.stamps) == 1:
