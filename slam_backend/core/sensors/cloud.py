@@ -1,12 +1,13 @@
 """sensor_msgs/PointCloud2 as named columns: how tables of observations travel without custom messages."""
 
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import BadMessage
-from ..measurement import Message
+from ..measurement import Array, Message
 
 _TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
 
@@ -33,6 +34,19 @@ def columns(message: Message) -> dict[str, NDArray[Any]]:
         offsets.append(int(field.offset))
     if len(set(names)) < len(names):
         raise BadMessage("point cloud names a field twice")
-    layout = np.dtype({"names": names, "formats": formats, "offsets": offsets, "itemsize": step})
+    if not names:
+        return {}
+    try:
+        layout = np.dtype({"names": names, "formats": formats, "offsets": offsets, "itemsize": step})
+    except ValueError as error:
+        raise BadMessage(f"point cloud has fields that cannot be: {error}") from None
     table = np.frombuffer(data[: points * step].tobytes(), dtype=layout)
     return {name: table[name] for name in names}
+
+
+def scalars(table: Mapping[str, NDArray[Any]], names: Sequence[str]) -> Array:
+    """(N, len(names)): columns side by side; BadMessage where a field holds more than one number per point."""
+    for name in names:
+        if table[name].ndim != 1:
+            raise BadMessage(f"point field '{name}' holds {table[name].shape[1]} numbers where one is needed")
+    return np.stack([table[name] for name in names], axis=1).astype(np.float64)

@@ -40,28 +40,25 @@ def decode_points(message: Message, source: str) -> Iterable[LandmarkObservation
     """sensor_msgs/msg/PointCloud2: one observation per point; the fields `id` and `x y [z]`,
     `range azimuth [elevation]` or `azimuth [elevation]`; noise by `cov` or `sigma_*`.
     """
-    from .cloud import columns
+    from .cloud import columns, scalars
 
     table = columns(message)
-    if "id" not in table:
-        raise BadMessage("point cloud of landmarks lacks the field 'id'")
+    if "id" not in table or table["id"].ndim != 1:
+        raise BadMessage("point cloud of landmarks lacks a field 'id' of one number per point")
     frame, _ = parse_frame(message.header.frame_id)
     stamp, count = stamp_of(message), len(table["id"])
     zero = np.zeros(count)
     form: Form
     axes: tuple[str, ...]
     if "x" in table and "y" in table:
-        form = "position"
-        axes = ("x", "y", "z")
-        fields = [table["x"], table["y"], table.get("z", zero)]
+        form, axes = "position", ("x", "y", "z")
+    elif "azimuth" in table and "range" in table:
+        form, axes = "bearing_range", ("azimuth", "elevation", "range")
     elif "azimuth" in table:
-        fields = [table["azimuth"], table.get("elevation", zero)]
         form, axes = "bearing", ("azimuth", "elevation")
-        if "range" in table:
-            form, axes, fields = "bearing_range", (*axes, "range"), [*fields, table["range"]]
     else:
         raise BadMessage("point cloud of landmarks has neither 'x' and 'y' nor 'azimuth'")
-    values = np.stack(fields, axis=1).astype(np.float64)
+    values = scalars({"z": zero, "elevation": zero, **table}, axes)
     for n in range(count):
         yield LandmarkObservation(
             stamp, source, frame, _name(table["id"][n]), form,

@@ -65,7 +65,7 @@ def decode_odometry(message: Message, source: str) -> RelativePose:
 
 def decode_points(message: Message, source: str) -> Iterable[RelativePose]:
     """sensor_msgs/msg/PointCloud2: a batch, one relative pose per point, by field names."""
-    from .cloud import columns
+    from .cloud import columns, scalars
 
     table = columns(message)
     need = [*(f"stamp_{e}_{p}" for e in "ij" for p in ("sec", "nsec")), "x", "y", "z", "qx", "qy", "qz", "qw"]
@@ -73,10 +73,12 @@ def decode_points(message: Message, source: str) -> Iterable[RelativePose]:
         raise BadMessage(f"point cloud of relative poses lacks the field '{missing[0]}'")
     frame, _ = parse_frame(message.header.frame_id)
     header = stamp_of(message)
-    poses = np.stack([table[name] for name in need[4:]], axis=1)
+    poses, times = scalars(table, need[4:]), scalars(table, need[:4])
+    if not np.isfinite(times).all():
+        raise BadMessage("point cloud of relative poses holds a stamp that is no number")
     for n in range(len(poses)):
-        stamp_i = int(table["stamp_i_sec"][n]) * SECOND + int(table["stamp_i_nsec"][n])
-        stamp_j = int(table["stamp_j_sec"][n]) * SECOND + int(table["stamp_j_nsec"][n])
+        i_sec, i_nsec, j_sec, j_nsec = (int(part) for part in times[n])
+        stamp_i, stamp_j = i_sec * SECOND + i_nsec, j_sec * SECOND + j_nsec
         yield RelativePose(
             max(header, stamp_i, stamp_j), source, stamp_i, stamp_j, frame, frame,
             frozen(poses[n]), frozen(_covariance(table, n)),
@@ -86,7 +88,10 @@ def decode_points(message: Message, source: str) -> Iterable[RelativePose]:
 def _covariance(table: dict[str, Array], n: int) -> Array:
     """36 numbers in ROS order from `cov` or `sigma_*`; zeros if the cloud states none."""
     if "cov" in table:
-        return np.asarray(table["cov"][n], dtype=np.float64).reshape(36)
+        given = np.asarray(table["cov"][n], dtype=np.float64).ravel()
+        if given.size != 36:
+            raise BadMessage(f"'cov' has {given.size} numbers where 36 are needed")
+        return given
     axes = ("x", "y", "z", "roll", "pitch", "yaw")
     common = {axis: "sigma_translation" if axis in "xyz" else "sigma_rotation" for axis in axes}
     sigmas = np.zeros(6)
