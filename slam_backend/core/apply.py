@@ -1,6 +1,7 @@
 """The way of a change: into the solver, whole; without what cannot be solved; with the parts that it connects."""
 
 from collections.abc import Callable, Collection
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -48,7 +49,7 @@ class Applier:
         if factor.kind == "pose":
             part = self._parts.of(factor.keys[0])
             return part is not None and self._parts.gauge(part) is not None
-        return len(factor.keys) == 2 and len(self._parts_of(factor)) == 2
+        return all(map(is_pose, factor.keys)) and len(self._parts_of(factor)) == 2
 
     def _parts_of(self, factor: Factor) -> set[int]:
         return {part for key in factor.keys if (part := self._parts.of(key)) is not None}
@@ -100,12 +101,13 @@ class Applier:
             try:
                 self.estimate = self._solver.update(delta)
             except SolverFailure as failure:
-                bad = [factor for factor in delta.add if factor.id in failure.guilty]
+                bad = [f for f in delta.add if f.id in failure.guilty] or list(delta.add)
                 self.decisions += [_unsolvable(factor, failure) for factor in bad]
-                if not bad or any(factor.kind in FOUNDATION for factor in bad):
+                if any(factor.kind in FOUNDATION for factor in bad):
                     raise
-                delta, whole = without(delta, failure.guilty), False
+                delta, whole = without(delta, {factor.id for factor in bad}), False
                 if not delta.add:
+                    self.decisions += [_kept(self._solver.factors[id_], failure) for id_ in delta.remove]
                     return False
                 continue
             finally:
@@ -144,6 +146,12 @@ def without(delta: Delta, ids: Collection[str]) -> Delta:
     return Delta(add, delta.remove, values, delta.waits, delta.decisions)
 
 
+def touched(delta: Delta) -> Delta:
+    """The change without first guesses that none of its factors needs."""
+    keys = {key for factor in delta.add for key in factor.keys}
+    return replace(delta, values={key: value for key, value in delta.values.items() if key in keys})
+
+
 def _split(delta: Delta, event: Factor) -> tuple[Delta, Delta]:
     """What must be in the graph before the event, and what can follow it; the event itself is in neither."""
     at = delta.add.index(event)
@@ -173,3 +181,10 @@ def _unsolvable(factor: Factor, failure: SolverFailure) -> Decision:
         str(failure),
         ends=factor.stamps,
     )
+
+
+def _kept(factor: Factor, failure: SolverFailure) -> Decision:
+    return Decision(
+        factor.stamp, factor.id, factor.source, "restored", "solver", "unsolvable",
+        f"not removed: {failure}", ends=factor.stamps,
+    )  # fmt: skip

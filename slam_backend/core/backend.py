@@ -9,8 +9,8 @@ from typing import Any
 import gtsam
 import numpy as np
 
-from .apply import Applier, without
-from .config import Config, OdometrySource
+from .apply import Applier, touched, without
+from .config import Config, LandmarkSource, OdometrySource, PoseSource, RelativeSource
 from .context import Context, Unusable
 from .errors import BadConfig, SlamError, SolverFailure
 from .graph import (
@@ -36,11 +36,18 @@ from .robust.kernels import noise_of
 from .sensors import SENSORS, relative
 from .sensors.odometry import OdometryPose
 from .sensors.relative import RelativePose
+from .settle import FAR
 from .solvers import SOLVERS, Solver
 from .space import SPACES
 from .trajectory import Snapshot, Trajectory
 
 GAUGE_SIGMA = 1e-3  # m and rad; of the prior that fixes a part of the graph in space
+SOURCES = {  # of a configuration that names none: one of each kind, by the name of its kind
+    "odometry": OdometrySource(),
+    "relative": RelativeSource(),
+    "landmark": LandmarkSource(),
+    "pose": PoseSource(),
+}
 NOTICEABLE = (1e-3, 1e-4)  # m, rad: a correction of the newest pose that counts as a revision
 
 
@@ -60,12 +67,16 @@ class Update:
 
 
 class Backend:
-    """The core of live node and replay alike. Measurements must come in settled order (see `settle`)."""
+    """The core of live node and replay alike. Measurements must come in settled order (see `settle`).
+
+    A config without sources takes measurements whose source is named as its kind: odometry, relative, landmark, pose.
+    """
 
     def __init__(
         self, config: Config | None = None, solver: Solver | None = None, robust: Sequence[Robust] = ()
     ) -> None:
-        self.config = config = config or Config(sources={"odometry": OdometrySource()})
+        config = config or Config()
+        self.config = config = config if config.sources else config.model_copy(update={"sources": SOURCES})
         self.space = space = SPACES[config.space]
         self.solver = solver or SOLVERS["isam2"](config, space)
         self._robust = robust
@@ -73,6 +84,8 @@ class Backend:
         if self._driver is None:
             raise BadConfig("no source drives the keyframes: add one of kind odometry or relative")
         driving = config.sources[self._driver]
+        if second := [n for n, s in config.sources.items() if s.kind == "odometry" and n != self._driver]:
+            raise BadConfig(f"source '{second[0]}': a second odometry; '{self._driver}' drives the keyframes")
         self._relative = driving.kind == "relative"
         self.track = Track(space, driving if isinstance(driving, OdometrySource) else OdometrySource())
         self.timeline = Timeline()
@@ -104,12 +117,11 @@ class Backend:
     def finish(self) -> list[Update]:
         """The input has ended: land what still waits; decide about what cannot land."""
         updates: list[Update] = []
-        if self._relative:
-            updates += self._close()
-        elif self._newest and self.track.newest > self._newest[0].stamp:
+        if not self._relative and self._newest and self.track.newest > self._newest[0].stamp:
             updates += self._extend(self.track.newest)
-        while self._newest and (window := self._window(self._newest[0].stamp)):
-            updates += self._update(self._newest[0], self._factors(window, None, self._newest[0], {}), ())
+        updates += self._close(last=True)
+        while self._newest and self._pending:  # what was waiting for that, or was put back
+            updates += self._close(last=True)
         self._refuse_leftovers()
         if self._newest and self._decisions:
             updates.append(self._told(self._newest[0]))
@@ -162,10 +174,14 @@ class Backend:
     # -- the way of a measurement ----------------------------------------------------------------
 
     def _offer(self, measurement: Measurement) -> None:
+        source = self.config.sources.get(measurement.source)
+        if source is None:
+            known = ", ".join(self.config.sources)
+            raise BadConfig(f"there is no source '{measurement.source}'; known: {known}")
         counts = self._counts[measurement.source]
         n = counts[measurement.stamp] = counts.get(measurement.stamp, -1) + 1
         self._pending.append(Offer(identify(measurement, n), measurement))
-        if getattr(self.config.sources[measurement.source], "keyframe", False):
+        if getattr(source, "keyframe", False):
             for stamp in measurement.ends or (measurement.stamp,):
                 heappush(self._asked, stamp)
 
@@ -213,33 +229,36 @@ class Backend:
             delta = SENSORS["odometry"].factors(odometry, a, b, here, self.config.sources[str(self._driver)])
         self._newest = (b, self.track.pose(stamp))
         self.track.protect()
-        return self._update(b, delta + self._factors(self._window(stamp), a, b, delta.values), [b])
+        window = self._window(stamp)
+        return self._update(b, delta + self._factors(window, a, b, delta.values), [b], window)
 
-    def _close(self) -> list[Update]:
-        """Without odometry: the measurements of one stamp are complete; their edges make the keyframes."""
-        window, self._pending = self._pending, []
-        if not window:
-            return []
+    def _close(self, last: bool = False) -> list[Update]:
+        """Without odometry: the measurements of one stamp are complete; their edges make the keyframes.
+
+        last: the input has ended; what is newer than the newest keyframe lands now or never.
+        """
         before = len(self.timeline)
-        a = self._newest[0] if self._newest else None
-        growth, window = self._grow(window)
+        growth, edges = self._grow()
         new = self.timeline.keyframes[before:]
+        a = self._newest[0] if self._newest else None
         b = max(new, key=lambda k: k.stamp, default=a)
-        if b is None:
+        if b is not None and (a is None or b.stamp > a.stamp):
+            self._newest = (b, self.track.pose(b.stamp))
+        window = edges + (self._window(FAR if last else self._newest[0].stamp) if self._newest else [])
+        if b is None or not window:
             self._decisions += growth.decisions
             return []
-        if a is None or b.stamp > a.stamp:
-            self._newest = (b, self.track.pose(b.stamp))
-        return self._update(b, growth + self._factors(window, a, b, growth.values), new)
+        return self._update(b, growth + self._factors(window, a, b, growth.values), new, window)
 
-    def _grow(self, window: Sequence[Offer]) -> tuple[Delta, list[Offer]]:
+    def _grow(self) -> tuple[Delta, list[Offer]]:
         """New keyframes along the driving source's edges, each from an end that is known; a part of its own where
-        neither end is. Returns first guesses and gauges, and the window with the edges that made keyframes marked.
+        neither end is. Returns first guesses and gauges, and the edges, those that made keyframes marked.
         """
         grown: list[Delta] = []
         guesses: dict[int, Any] = {}
-        edges = [offer for offer in window if offer.measurement.source == self._driver]
-        rest = [offer for offer in window if offer.measurement.source != self._driver]
+        marked: list[Offer] = []
+        edges = [offer for offer in self._pending if offer.measurement.source == self._driver]
+        self._pending = [offer for offer in self._pending if offer.measurement.source != self._driver]
         while edges:
             at = self.timeline.at
             n = next(
@@ -262,13 +281,14 @@ class Backend:
                 guesses.update(self._branch(i, m.stamp_j, step, guesses))
             elif j is not None and i is None:
                 guesses.update(self._branch(j, m.stamp_i, step.inverse(), guesses))
-            rest.append(offer._replace(motion=i is None or j is None))
-        return total(grown) + Delta(values=guesses), rest
+            marked.append(offer._replace(motion=i is None or j is None))
+        return total(grown) + Delta(values=guesses), marked
 
     def _begin(self, stamp: int) -> Delta:
         first = keyframe(len(self.timeline), stamp)
         self.timeline.add(first)
         self.track.add(stamp, self.space.identity)
+        self.track.protect()
         return self._gauge(first)
 
     def _branch(self, known: Keyframe, stamp: int, step: Pose, guesses: Mapping[int, Any]) -> dict[int, Any]:
@@ -277,6 +297,7 @@ class Backend:
         self.timeline.add(new)
         self.parts.put(new.pose, known.pose)
         self.track.add(stamp, self.track.pose(known.stamp).compose(step))
+        self.track.protect()
         return {new.pose: pose.compose(step)}
 
     def _gauge(self, first: Keyframe) -> Delta:
@@ -328,33 +349,38 @@ class Backend:
 
     # -- the way of a change ---------------------------------------------------------------------
 
-    def _update(self, b: Keyframe, delta: Delta, new: Sequence[Keyframe]) -> list[Update]:
+    def _update(
+        self, b: Keyframe, delta: Delta, new: Sequence[Keyframe], window: Sequence[Offer]
+    ) -> list[Update]:
         """Solve: motion and all that nothing judges first, then what the robust stages let in."""
         self._decisions += delta.decisions
         for wait in delta.waits:
             self._wait(wait)
         judged = tuple(f for f in delta.add if any(f.kind in stage.kinds for stage in self._robust))
+        sure = without(delta, {factor.id for factor in judged})
         try:
-            self._applier.apply(without(delta, {factor.id for factor in judged}))
+            self._applier.apply(sure)
             if self._robust:
-                self._judge(Delta(judged, values=delta.values))
+                late = {key: guess for key, guess in delta.values.items() if key not in sure.values}
+                self._judge(Delta(judged, values=late))
         except SolverFailure:
-            self._give_up(new)
-            return []
-        return [self._told(b, delta.values.get(b.pose))]
+            self._give_up(delta, new, window)
+        return [self._told(b, delta.values.get(b.pose))] if self.timeline.at(b.stamp) is b else []
 
     def _judge(self, proposed: Delta) -> None:
         for stage in self._robust:
             proposed, decisions = stage.admit(proposed, self.estimate)
             self._decisions += decisions
-        self._applier.apply(proposed)
+        self._applier.apply(touched(proposed))
         for stage in self._robust:
             amendment, decisions = stage.review(self.estimate)
             self._decisions += decisions
             self._applier.apply(amendment)
 
-    def _give_up(self, new: Sequence[Keyframe]) -> None:
-        """Not even the motion could be solved: the keyframes are taken back, the next one spans the gap."""
+    def _give_up(self, delta: Delta, new: Sequence[Keyframe], window: Sequence[Offer]) -> None:
+        """Not even the motion could be solved: the keyframes are taken back. The next one spans the gap, and takes what
+        else was to land here.
+        """
         estimate = self._applier.estimate
         for gone in reversed(new):
             if estimate is None or not estimate.knows(gone.pose):
@@ -362,6 +388,9 @@ class Backend:
                 self.parts.drop(gone.pose)
         last = self.timeline.newest
         self._newest = (last, self.track.pose(last.stamp)) if last else None
+        refused = {d.id for d in (*self._decisions, *self._applier.decisions) if d.verdict == "refused"}
+        lost = {factor.id for factor in delta.add} - refused - self.solver.factors.keys()
+        self._pending += [offer for offer in window if offer.id in lost]
 
     def _told(self, b: Keyframe, guess: Pose | None = None) -> Update:
         """The update for the newest keyframe, with the decisions since the last one."""
