@@ -43,8 +43,8 @@ def decode_points(message: Message, source: str) -> Iterable[LandmarkObservation
     from .cloud import columns, scalars
 
     table = columns(message)
-    if "id" not in table or table["id"].ndim != 1:
-        raise BadMessage("point cloud of landmarks lacks a field 'id' of one number per point")
+    if "id" not in table:
+        raise BadMessage("point cloud of landmarks lacks the field 'id'")
     frame, _ = parse_frame(message.header.frame_id)
     stamp, count = stamp_of(message), len(table["id"])
     zero = np.zeros(count)
@@ -58,7 +58,7 @@ def decode_points(message: Message, source: str) -> Iterable[LandmarkObservation
         form, axes = "bearing", ("azimuth", "elevation")
     else:
         raise BadMessage("point cloud of landmarks has neither 'x' and 'y' nor 'azimuth'")
-    values = scalars({"z": zero, "elevation": zero, **table}, axes)
+    values = scalars({"z": zero, "elevation": zero, **table}, ("id", *axes))[:, 1:]
     for n in range(count):
         yield LandmarkObservation(
             stamp, source, frame, _name(table["id"][n]), form,
