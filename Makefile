@@ -1,5 +1,5 @@
 # demo   a real log to a picture       test      quick proofs      test-all  and the long ones
-# lint   style and types               bench     measurements      clean     all that make made
+# lint   style and types               bench     measurements      docs      generated pages      clean
 EXTRAS ?= dev
 
 # The newest Python that gtsam has wheels for and that can make a venv; a name on the PATH alone proves neither.
@@ -10,7 +10,7 @@ BIN    := .venv/bin
 BAG    := demo/victoria_park.mcap
 RUN    := demo/run
 
-.PHONY: demo venv test test-all lint bench clean
+.PHONY: demo venv test test-all lint bench docs clean
 .DELETE_ON_ERROR:
 
 demo: .venv/.stamp-base
@@ -35,6 +35,9 @@ lint: .venv/.stamp-$(EXTRAS)
 
 bench: .venv/.stamp-$(EXTRAS)
 	$(BIN)/python -m bench
+
+docs: .venv/.stamp-$(EXTRAS)
+	$(BIN)/python -m slam_backend.lab.settings > docs/settings.md
 
 clean:
 	rm -rf .venv demo build install log *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis
