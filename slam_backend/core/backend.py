@@ -146,15 +146,14 @@ class Backend:
         names = tuple(name for name, key in self._landmarks.items() if self.parts.of(key) is not None)
         values = self._applier.estimate.values() if self._applier.estimate else gtsam.Values()
         sevens = self.space.sevens(values, [k.pose for k in keyframes])
-        odometry = np.array([self.space.seven(self.track.pose(k.stamp)) for k in keyframes]).reshape(-1, 7)
         points = np.zeros((len(names), 3))
         for row, name in zip(points, names, strict=True):
             row[: self.space.point_dimension] = self.space.point_in(values, self._landmarks[name])
-        drifted = Trajectory(stamps, odometry)
+        odometry = self.track.trajectory()
         return Snapshot(
             Trajectory(stamps, sevens),
             np.array([k.index for k in keyframes], dtype=np.int64),
-            drifted.from_start(sevens[0]) if len(keyframes) else drifted,
+            odometry.from_start(sevens[0], keyframes[0].stamp) if keyframes else odometry,
             names,
             points,
             self._revision,

@@ -18,6 +18,7 @@ from .config import Keyframes, OdometrySource
 from .graph import Keyframe, Motion, Pose
 from .measurement import SECOND, Array
 from .space import Space, interpolate
+from .trajectory import Trajectory
 
 SAMPLES_PER_STEP = 32  # odometry samples kept between two keyframes; a parked robot must not fill the memory
 
@@ -68,6 +69,13 @@ class Track:
     @property
     def newest(self) -> int:
         return self._stamps[-1]
+
+    def trajectory(self) -> Trajectory:
+        """`odom_T_base` at every sample that is kept."""
+        if not self._stamps:
+            return Trajectory(np.zeros(0, dtype=np.int64), np.zeros((0, 7)))
+        stamps, rows = np.unique(np.array(self._stamps, dtype=np.int64), return_index=True)
+        return Trajectory(stamps, self._space.sevens_of(np.array(self._numbers)[rows]))
 
     def pose(self, stamp: int) -> Pose:
         """`odom_T_base` at a stamp that the track covers."""

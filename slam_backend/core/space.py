@@ -95,6 +95,10 @@ class Space(Protocol):
 
     def sevens(self, values: gtsam.Values, keys: Sequence[int]) -> Array: ...
 
+    def sevens_of(self, numbers: Array) -> Array:
+        """Rows of `numbers` to (N, 7)."""
+        ...
+
 
 def interpolate(space: Space, start: Pose, end: Pose, ratio: float) -> Pose:
     """The pose at `ratio` of the way, along the constant twist from start to end."""
@@ -191,10 +195,12 @@ class Planar:
         return np.asarray(values.atPoint2(key))
 
     def sevens(self, values: gtsam.Values, keys: Sequence[int]) -> Array:
-        rows = np.array([self.numbers(values.atPose2(key)) for key in keys]).reshape(-1, 3)
-        sevens = np.zeros((len(rows), 7))
-        sevens[:, :2] = rows[:, :2]
-        sevens[:, 5], sevens[:, 6] = np.sin(rows[:, 2] / 2), np.cos(rows[:, 2] / 2)
+        return self.sevens_of(np.array([self.numbers(values.atPose2(key)) for key in keys]).reshape(-1, 3))
+
+    def sevens_of(self, numbers: Array) -> Array:
+        sevens = np.zeros((len(numbers), 7))
+        sevens[:, :2] = numbers[:, :2]
+        sevens[:, 5], sevens[:, 6] = np.sin(numbers[:, 2] / 2), np.cos(numbers[:, 2] / 2)
         return sevens
 
 
@@ -315,6 +321,9 @@ class Spatial:
         if not keys:
             return np.zeros((0, 7))
         return seven_of_matrix(np.stack([values.atPose3(key).matrix() for key in keys]))
+
+    def sevens_of(self, numbers: Array) -> Array:
+        return seven_of_matrix(numbers.reshape(-1, 3, 4))
 
 
 SPACES: dict[str, Space] = {"2d": Planar(), "3d": Spatial()}  # type: ignore[dict-item]

@@ -47,9 +47,10 @@ class Trajectory:
         result[(wanted < self.stamps[0]) | (wanted > self.stamps[-1])] = np.nan
         return result
 
-    def from_start(self, start: Array) -> "Trajectory":
-        """The same motion, begun at the pose `start` (7,)."""
-        moved = matrix_of(start) @ inverse_of(matrix_of(self.sevens[0])) @ self.poses
+    def from_start(self, start: Array, stamp: int | None = None) -> "Trajectory":
+        """The same motion, moved as a whole so that its pose at `stamp` (none: its first) is `start` (7,)."""
+        begin = self.sevens[0] if stamp is None else self.at([stamp])[0]
+        moved = matrix_of(start) @ inverse_of(matrix_of(begin)) @ self.poses
         return Trajectory(self.stamps, seven_of_matrix(moved))
 
 
@@ -72,7 +73,7 @@ class Snapshot:
     """The estimate at one moment, a copy that never changes.
 
     trajectory: every keyframe in order of stamp. indices: (N,) their indices. odometry: what odometry alone says, from
-    the same start. landmarks: (L, 3) in map, with `names`; revision: see Backend.
+    the same start, at every sample that is kept. landmarks: (L, 3) in map, with `names`; revision: see Backend.
     """
 
     trajectory: Trajectory
