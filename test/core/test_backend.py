@@ -405,7 +405,7 @@ class Doubter:
             )
         return Delta(tuple(kept), values=proposed.values), tuple(decisions)
 
-    def review(self, estimate):
+    def review(self, estimate):  # noqa: ARG002
         regretted, self.regretted = self.regretted, None
         return Delta(remove=(regretted,) if regretted else ()), ()
 

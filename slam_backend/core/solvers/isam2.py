@@ -24,8 +24,8 @@ from ..graph import Decision, Delta, Estimate, Factor, Pose, is_pose
 from ..measurement import Array
 from ..space import Space
 
-SETTLED = 1e-9  # largest change of a variable (m, rad) at which a rebuild is done
-ROUNDING = 1e-10  # relative change of the cost that is only the rounding of the normal equations
+SETTLED = 1e-10  # largest change of a variable (m, rad) at which a rebuild is done
+ROUNDING = 1e-10  # relative change of the cost at which a step that no longer shrinks is only rounding
 ROUNDS = 30  # of re-linearization in a rebuild
 JOINING = frozenset({"loop", "pose"})  # kinds of factors after which one update is not enough
 
@@ -171,7 +171,7 @@ class Isam2:
     def _settled(self, factors: Iterable[Factor], values: gtsam.Values) -> Built:
         """A new ISAM2 with fresh linearization points, renewed until the largest step is below SETTLED."""
         factors = list(factors)
-        graph, error = _graph(factors), np.inf
+        graph, error, last = _graph(factors), np.inf, np.inf
         for _ in range(ROUNDS if factors else 0):
             isam, slots = self._built(factors, values)
             found = isam.calculateBestEstimate()
@@ -180,9 +180,9 @@ class Isam2:
             if not (isfinite(step) and isfinite(now)):
                 raise RuntimeError("the rebuilt estimate is not finite")
             values = found
-            if step < SETTLED or abs(error - now) <= ROUNDING * now:
+            if step < SETTLED or (step >= last and abs(error - now) <= ROUNDING * now):
                 return isam, slots
-            error = now
+            error, last = now, step
         if not factors:
             return self._empty(), {}
         raise Unsettled("the rebuilt estimate does not settle")
