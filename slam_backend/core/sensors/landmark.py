@@ -17,6 +17,8 @@ from ..space import Space
 
 Form = Literal["position", "bearing_range", "bearing"]
 
+NEAREST = 1e-6  # m; nearer, a landmark has no direction
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LandmarkObservation(Measurement):
@@ -141,7 +143,7 @@ def _polar(
             return value, space.bearing_noise(value, covariance), point
         value, covariance = space.to_cartesian(value, covariance)
     point, covariance = moved(value, covariance, mount, motion)
-    if not np.any(point):
+    if np.linalg.norm(point) < NEAREST:
         raise Unusable("range", "the landmark is where the robot is")
     return (*space.to_polar(point, covariance), point)
 
