@@ -1,0 +1,253 @@
+"""Sightings of landmarks: what the messages say, and factors that fit the truth with the noise they state."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import gtsam
+import numpy as np
+import pytest
+
+from slam_backend.core.config import LandmarkSource
+from slam_backend.core.errors import BadMessage
+from slam_backend.core.graph import UNTIL_JOINED
+from slam_backend.core.measurement import SECOND, frozen
+from slam_backend.core.sensors.landmark import LandmarkObservation, decode_points, factors
+
+AT_KEYFRAME, AFTER, BEFORE = 6 * SECOND, 7 * SECOND + SECOND // 3, 5 * SECOND - SECOND // 7
+STAMPS = pytest.mark.parametrize("stamp", [AT_KEYFRAME, AFTER, BEFORE], ids=["at", "after", "before"])
+FRAMES = pytest.mark.parametrize("frame", ["", "mast"], ids=["base", "mast"])
+FORMS = pytest.mark.parametrize("form", ["position", "bearing_range", "bearing"])
+
+
+def form_of(point, form) -> np.ndarray:
+    """What a sensor says of a point in its own frame."""
+    x, y, z = np.append(point, np.zeros(3 - len(point)))
+    azimuth, elevation, distance = (
+        np.arctan2(y, x),
+        np.arctan2(z, np.hypot(x, y)),
+        np.sqrt(x * x + y * y + z * z),
+    )
+    return {
+        "position": np.array([x, y, z]),
+        "bearing_range": np.array([azimuth, elevation, distance]),
+        "bearing": np.array([azimuth, elevation]),
+    }[form]
+
+
+SIGMAS = {"position": [0.01, 0.03, 0.02], "bearing_range": [0.004, 0.001, 0.02], "bearing": [0.004, 0.001]}
+UNUSED = {"position": 2, "bearing_range": 1, "bearing": 1}
+
+
+def noise_of_form(rng, world, form, spread) -> np.ndarray:
+    """A full covariance; in the plane, nonsense on the axis that it lacks."""
+    covariance = spread(rng, SIGMAS[form])
+    if world.space.name == "2d":
+        k = UNUSED[form]
+        covariance[k, :] = covariance[:, k] = np.nan
+    return covariance
+
+
+def sighting(world, form, frame, stamp, covariance, rng=None) -> LandmarkObservation:
+    """Of the oak; true, or with noise in the sensor and in the motion since the keyframe."""
+    base = world.track.pose(stamp) if rng is None else world.wrongly(rng, stamp)
+    sensor = base.compose(world.mounts.get(frame))
+    value = form_of(sensor.transformTo(world.point("oak")), form)
+    if rng is not None:
+        value = value + rng.multivariate_normal(np.zeros(len(value)), np.nan_to_num(covariance))
+    return LandmarkObservation(stamp, "trees", frame, "oak", form, frozen(value), frozen(covariance))
+
+
+@FORMS
+@FRAMES
+@STAMPS
+def test_a_true_sighting_has_no_error_at_the_truth(world, offered, form, frame, stamp):
+    seen = sighting(world, form, frame, stamp, np.full((len(SIGMAS[form]),) * 2, np.nan))
+    (made,) = factors(offered(seen), None, None, world.context(), LandmarkSource()).add
+    assert made.keys == (world.place(stamp).keyframe.pose, world.key("oak"))
+    assert (made.kind, made.source, made.stamp) == ("landmark", "trees", stamp)
+    assert made.factor.error(world.values()) < 1e-12
+
+
+@FORMS
+@FRAMES
+@STAMPS
+def test_the_noise_is_that_of_the_sighting_and_of_the_motion(
+    world, offered, agree, spread, form, frame, stamp
+):
+    """Whitened by their own noise, errors at the truth are standard normal."""
+    rng = np.random.default_rng(1)
+    covariance = noise_of_form(rng, world, form, spread)
+    context, values, errors = world.context(), world.values(), []
+    for _ in range(1_500):
+        seen = sighting(world, form, frame, stamp, covariance, rng)
+        (made,) = factors(offered(seen), None, None, context, LandmarkSource()).add
+        errors.append(made.factor.whitenedError(values))
+    agree(errors)
+
+
+def test_bearing_and_range_from_the_keyframe_itself_is_the_native_factor(world, offered, spread):
+    rng, space = np.random.default_rng(2), world.space
+    covariance = spread(rng, SIGMAS["bearing_range"])
+    seen = sighting(world, "bearing_range", "", AT_KEYFRAME, covariance, rng)
+    (made,) = factors(offered(seen), None, None, world.context(), LandmarkSource()).add
+    azimuth, _, distance = seen.value
+    keys = world.timeline.keyframes[1].pose, world.key("oak")
+    if space.name == "2d":
+        noise = gtsam.noiseModel.Gaussian.Covariance(covariance[np.ix_([0, 2], [0, 2])])
+        native = gtsam.BearingRangeFactor2D(*keys, gtsam.Rot2(azimuth), distance, noise)
+    else:
+        isotropic = np.diag([0.01**2, 0.01**2, 0.05**2])
+        seen = replace(seen, covariance=frozen(isotropic))
+        seen = replace(seen, value=frozen([azimuth, 0.0, distance]))  # there azimuth and elevation are equals
+        (made,) = factors(offered(seen), None, None, world.context(), LandmarkSource()).add
+        ahead = gtsam.Unit3(np.array([np.cos(azimuth), np.sin(azimuth), 0.0]))
+        native = gtsam.BearingRangeFactor3D(
+            *keys, ahead, distance, gtsam.noiseModel.Gaussian.Covariance(isotropic)
+        )
+    values = world.values()
+    assert made.factor.error(values) == pytest.approx(native.error(values), rel=1e-9)
+
+
+@pytest.mark.parametrize("form", ["position", "bearing_range"])
+@FRAMES
+def test_a_new_landmark_starts_where_it_is_seen(world, offered, form, frame):
+    world.known.discard("oak")
+    seen = sighting(world, form, frame, AFTER, np.full((3, 3), np.nan))
+    delta = factors(offered(seen, seen), None, None, world.context(), LandmarkSource())
+    assert list(delta.values) == [world.key("oak")]
+    np.testing.assert_allclose(delta.values[world.key("oak")], world.point("oak"), atol=1e-9)
+    assert len(delta.add) == 2
+
+
+def test_a_bearing_alone_waits_until_its_landmark_has_a_position(world, offered):
+    world.known.discard("oak")
+    bearing = sighting(world, "bearing", "", AT_KEYFRAME, np.full((2, 2), np.nan))
+    delta = factors(offered(bearing), None, None, world.context(), LandmarkSource())
+    assert not delta.add
+    assert [wait.until for wait in delta.waits] == [world.key("oak")]
+    placing = sighting(world, "position", "", AT_KEYFRAME, np.full((3, 3), np.nan))
+    delta = factors(offered(placing, bearing), None, None, world.context(), LandmarkSource())
+    assert len(delta.add) == 2
+    assert not delta.waits
+
+
+def test_a_landmark_of_another_part_waits_until_they_are_joined(world, offered):
+    world.parts[world.key("oak")] = 7
+    seen = sighting(world, "position", "", AT_KEYFRAME, np.full((3, 3), np.nan))
+    delta = factors(offered(seen), None, None, world.context(), LandmarkSource())
+    assert [wait.until for wait in delta.waits] == [UNTIL_JOINED]
+
+
+def test_what_cannot_be_used_becomes_a_decision(world, offered):
+    good = sighting(world, "position", "", AT_KEYFRAME, np.full((3, 3), np.nan))
+    origin = world.mounts.get("mast").inverse().translation()
+    value = np.append(origin, np.zeros(3 - len(origin)))
+    bad = [
+        replace(good, frame="tail"),
+        replace(good, stamp=40 * SECOND),
+        replace(good, frame="mast", value=value),
+    ]
+    delta = factors(offered(*bad), None, None, world.context(), LandmarkSource())
+    assert [(d.verdict, d.stage, d.reason) for d in delta.decisions] == [
+        ("refused", "landmark", "unknown_frame"),
+        ("refused", "landmark", "uncovered"),
+        ("refused", "landmark", "range"),
+    ]
+    assert not delta
+
+
+@FORMS
+def test_noise_that_is_not_stated_is_the_configured_one(world, offered, form):
+    config = LandmarkSource(sigma_position=0.3, sigma_range=0.2, sigma_bearing=0.1)
+    size = len(SIGMAS[form])
+    seen = sighting(world, form, "", AT_KEYFRAME, np.full((size, size), np.nan))
+    stated = {"position": [0.3] * 3, "bearing_range": [0.1, 0.1, 0.2], "bearing": [0.1, 0.1]}[form]
+    same = replace(seen, covariance=frozen(np.diag(np.square(stated))))
+    made = factors(offered(seen, same), None, None, world.context(), config).add
+    default, explicit = (each.factor.noiseModel().R() for each in made)
+    np.testing.assert_allclose(default, explicit, rtol=1e-9)
+
+
+def test_the_kernel_of_the_source_is_around_the_noise(world, offered):
+    seen = sighting(world, "position", "", AT_KEYFRAME, np.full((3, 3), np.nan))
+    (made,) = factors(offered(seen), None, None, world.context(), LandmarkSource(kernel="cauchy")).add
+    assert isinstance(made.factor.noiseModel(), gtsam.noiseModel.Robust)
+
+
+# -- messages ----------------------------------------------------------------------------------------------------
+
+
+def cloud(stamp=(3, 5), frame="mast", **columns) -> SimpleNamespace:
+    """A PointCloud2 with one float64 field per column; a column may hold vectors."""
+    arrays = {name: np.asarray(column, dtype=np.float64) for name, column in columns.items()}
+    fields, parts, offset = [], [], 0
+    for name, array in arrays.items():
+        count = array.shape[1] if array.ndim > 1 else 1
+        fields.append(SimpleNamespace(name=name, offset=offset, datatype=8, count=count))
+        parts.append(array.reshape(len(array), count))
+        offset += 8 * count
+    table = np.hstack(parts)
+    header = SimpleNamespace(stamp=SimpleNamespace(sec=stamp[0], nanosec=stamp[1]), frame_id=frame)
+    return SimpleNamespace(
+        header=header, width=len(table), height=1, point_step=offset, fields=fields, is_bigendian=False,
+        data=np.ascontiguousarray(table).tobytes(),
+    )  # fmt: skip
+
+
+def test_positions_ids_and_sigmas_are_read_by_field_name():
+    message = cloud(
+        frame="/mast",
+        id=[7, 2.5],
+        x=[1, 4],
+        y=[2, 5],
+        z=[3, 6],
+        sigma_position=[0.1, 0.2],
+        sigma_z=[0.5, 0.6],
+    )
+    first, second = decode_points(message, "trees")
+    assert (first.stamp, first.source, first.frame) == (3 * SECOND + 5, "trees", "mast")
+    assert (first.form, first.landmark, second.landmark) == ("position", "7", "2.5")
+    np.testing.assert_array_equal(second.value, [4, 5, 6])
+    np.testing.assert_allclose(first.covariance, np.diag([0.01, 0.01, 0.25]))
+    assert not first.value.flags.writeable
+
+
+def test_missing_axes_are_zero_and_missing_noise_is_nan():
+    (flat,) = decode_points(cloud(id=[1], x=[1], y=[2]), "trees")
+    np.testing.assert_array_equal(flat.value, [1, 2, 0])
+    assert np.isnan(np.diag(flat.covariance)).all()
+    (angle,) = decode_points(cloud(id=[1], azimuth=[0.5], sigma=[0.1]), "trees")
+    assert angle.form == "bearing"
+    np.testing.assert_array_equal(angle.value, [0.5, 0.0])
+    (polar,) = decode_points(
+        cloud(id=[1], range=[4], azimuth=[0.5], elevation=[0.1], sigma_range=[0.3]), "trees"
+    )
+    assert polar.form == "bearing_range"
+    np.testing.assert_array_equal(polar.value, [0.5, 0.1, 4.0])
+    np.testing.assert_allclose(np.diag(polar.covariance), [np.nan, np.nan, 0.09])
+
+
+def test_a_full_covariance_is_taken_as_it_stands():
+    covariance = np.arange(9.0)
+    (seen,) = decode_points(cloud(id=[1], x=[1], y=[2], z=[3], cov=[covariance]), "trees")
+    np.testing.assert_array_equal(seen.covariance, covariance.reshape(3, 3))
+
+
+def test_a_cloud_without_points_says_nothing():
+    assert not list(decode_points(cloud(id=np.zeros(0), x=np.zeros(0), y=np.zeros(0)), "trees"))
+
+
+@pytest.mark.parametrize(
+    ("columns", "text"),
+    [
+        ({"x": [1], "y": [1]}, "'id'"),
+        ({"id": [1], "range": [2]}, "azimuth"),
+        ({"id": [1], "x": [1]}, "azimuth"),
+        ({"id": [1], "x": [1], "y": [1], "cov": [[1, 2]]}, "9 are needed"),
+        ({"id": [1], "x": [[1, 2]], "y": [[1, 2]]}, "'x' holds 2 numbers"),
+        ({"id": [[1, 2]], "x": [1], "y": [1]}, "'id' holds 2 numbers"),
+    ],
+)
+def test_a_cloud_that_cannot_be_understood_is_one_clear_line(columns, text):
+    with pytest.raises(BadMessage, match=text):
+        list(decode_points(cloud(**columns), "trees"))
