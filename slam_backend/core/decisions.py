@@ -39,6 +39,10 @@ class DecisionLog:
     def __len__(self) -> int:
         return len(self._kept)
 
+    def since(self, count: int) -> list[Decision]:
+        """Those after the first `count`."""
+        return self._kept[count:]
+
     def by_rule(self) -> dict[str, int]:
         """`stage/reason` -> how often, sorted."""
         counts: Counter[str] = Counter()

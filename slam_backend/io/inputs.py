@@ -26,9 +26,11 @@ Stream = Iterator[Measurement | Decision]
 class Inputs(Protocol):
     """count: records or measurements to come, for progress. read: how many have been read."""
 
-    paths: Sequence[Path]
     count: int
     read: int
+
+    @property
+    def paths(self) -> Sequence[Path]: ...
 
     @property
     def damage(self) -> list[str]:

@@ -25,8 +25,9 @@ from ..core.settle import settled
 from ..core.trajectory import Snapshot, Trajectory
 from .configfile import configured
 from .discover import discover
-from .inputs import BagInputs, GraphInput, open_inputs
+from .inputs import Inputs, open_inputs
 
+RECENT = 500  # updates
 VERSIONS = ("slam_backend", "gtsam", "numpy", "rosbags")
 
 
@@ -66,7 +67,7 @@ def settled_stream(
 class Run:
     """One replay. An iterator of updates; progress, early stop and fleets wrap it from outside."""
 
-    def __init__(self, inputs: BagInputs | GraphInput, config: Config, notes: list[str]) -> None:
+    def __init__(self, inputs: Inputs, config: Config, notes: list[str]) -> None:
         self.config, self.notes, self.inputs = config, notes, inputs
         self.backend = Backend(config)
         self.decisions = DecisionLog()
@@ -142,6 +143,11 @@ class Seconds:
         self.solving += seconds
         if updates:
             self._updates.append(seconds)
+
+    def recent(self) -> tuple[float, float]:
+        """Median and 99th percentile, in ms, of the last updates."""
+        ms = np.array(self._updates[-RECENT:] or [0.0]) * 1e3
+        return float(np.percentile(ms, 50)), float(np.percentile(ms, 99))
 
     def summary(self) -> dict[str, Any]:
         ms = np.array(self._updates or [0.0]) * 1e3

@@ -1,0 +1,162 @@
+"""The core in a process of its own, fed from the journal.
+
+gtsam keeps the GIL for a whole update: a thread would stall the node's callbacks for as long. Between the two go plain data:
+records in; small reports out at once; a snapshot, a saved run or an optimization only when asked. The worker runs the same
+stream as `replay`, so what runs live is what runs offline; a request is answered between two records, at the state of the watermark.
+"""
+
+import resource
+import signal
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from multiprocessing.connection import Connection
+from pathlib import Path
+from typing import Any, Literal
+
+from ..core.backend import Update
+from ..core.config import Config
+from ..core.errors import SlamError
+from ..core.graph import Decision
+from ..core.measurement import Measurement
+from .cdr import Decoder
+from .journal import Row
+from .replay import Result, Run
+from .rundir import write_run
+from .typestore import typestore_of
+
+RequestName = Literal["snapshot", "save", "finish"]
+
+
+@dataclass(frozen=True, slots=True)
+class Report:
+    """What changed since the last one. applied: id of the newest row that was read. update_ms: median and p99."""
+
+    applied: int
+    updates: tuple[Update, ...]
+    decisions: tuple[Decision, ...]
+    factors: int
+    update_ms: tuple[float, float]
+    memory_mb: float
+
+
+@dataclass(frozen=True, slots=True)
+class Request:
+    """snapshot: a Snapshot. save: write a run directory at `argument`. finish: the input has ended; save, and end."""
+
+    id: int
+    name: RequestName
+    argument: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Answer:
+    """To the request of that id. error: one line, when it could not be done."""
+
+    id: int
+    content: Any = None
+    error: str = ""
+
+
+class LiveInputs:
+    """Rows and requests from a pipe, as the inputs of a Run. idle: called before each wait."""
+
+    def __init__(
+        self,
+        pipe: Connection,
+        table: Mapping[str, tuple[str, str]],
+        idle: Callable[[], None],
+        answer: Callable[[Request], Any],
+    ) -> None:
+        self.paths = [Path("live")]
+        self.count = self.read = self.applied = 0
+        self.damage: list[str] = []
+        self.last: Request | None = None
+        self._pipe, self._idle, self._answer = pipe, idle, answer
+        self._decoder = Decoder(typestore_of(()), table)
+
+    def stream(self, config: Config) -> Iterator[Measurement | Decision]:  # noqa: ARG002  # the table is given
+        while True:
+            self._idle()
+            try:
+                message = self._pipe.recv()
+            except EOFError:
+                return  # the node is gone: the journal has everything
+            if not isinstance(message, Request):
+                yield from self._decoded(message)
+            elif message.name == "finish":
+                self.last = message
+                return
+            else:
+                self._pipe.send(self.answered(message))
+
+    def _decoded(self, rows: Iterable[Row]) -> Iterator[Measurement | Decision]:
+        for row in rows:
+            self.read += 1
+            self.applied = row.id
+            yield from self._decoder.decode(row.record)
+
+    def answered(self, request: Request) -> Answer:
+        try:
+            return Answer(request.id, self._answer(request))
+        except (SlamError, OSError) as error:
+            return Answer(request.id, error=str(error))
+
+    def vertex(self, stamp: int) -> int | None:  # noqa: ARG002  # there is no graph file
+        return None
+
+    def close(self) -> None:
+        """The pipe belongs to the process."""
+
+    def __enter__(self) -> "LiveInputs":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+
+class _Worker:
+    """Runs the stream, reports after each batch of rows, answers requests."""
+
+    def __init__(self, pipe: Connection, config: Config, table: Mapping[str, tuple[str, str]]) -> None:
+        self._pipe = pipe
+        self._inputs = LiveInputs(pipe, table, self._report, self._answer)
+        self._run = Run(self._inputs, config, [])
+        self._updates: list[Update] = []
+        self._told = 0
+
+    def serve(self) -> None:
+        for update in self._run:
+            self._updates.append(update)
+        self._report()
+        last = self._inputs.last
+        if last is not None:
+            self._pipe.send(self._inputs.answered(last))
+
+    def _report(self) -> None:
+        """Send what is new, if anything is."""
+        decisions = self._run.decisions.since(self._told)
+        self._told += len(decisions)
+        updates, self._updates = tuple(self._updates), []
+        report = Report(
+            self._inputs.applied,
+            updates,
+            tuple(decisions),
+            len(self._run.backend.solver.factors),
+            self._run.seconds.recent(),
+            resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
+        )
+        self._pipe.send(report)
+
+    def _answer(self, request: Request) -> Any:
+        if request.name == "snapshot":
+            return self._run.backend.snapshot()
+        result = Result(self._run)
+        write_run(result, Path(request.argument))
+        return result.summary
+
+
+def serve(pipe: Connection, config: Config, table: Mapping[str, tuple[str, str]]) -> None:
+    """The process: topic -> (source, kind) in `table`. Ends when asked to finish, or when the node is gone."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the node's affair: it will ask to finish
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)
+    _Worker(pipe, config, table).serve()
