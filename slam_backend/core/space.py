@@ -13,7 +13,7 @@ from typing import Any, Protocol
 import gtsam
 import numpy as np
 
-from .geometry import covariance_from_ros, seven_of_matrix
+from .geometry import covariance_from_ros, covariance_to_ros, seven_of_matrix
 from .graph import Pose
 from .measurement import Array
 
@@ -43,6 +43,10 @@ class Space(Protocol):
 
     def covariance(self, ros: Array, pose: Pose) -> Array:
         """(6, 6) in ROS order, of `pose`, to the tangent of its child."""
+        ...
+
+    def covariance_to_ros(self, covariance: Array, pose: Pose) -> Array:
+        """The inverse of `covariance`: (6, 6), zeros on axes that the space lacks."""
         ...
 
     def twist_covariance(self, ros: Array) -> Array:
@@ -136,6 +140,13 @@ class Planar:
         c, s = cos(pose.theta()), sin(pose.theta())
         to_child = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
         return np.asarray(to_child @ block @ to_child.T)
+
+    def covariance_to_ros(self, covariance: Array, pose: Pose) -> Array:
+        c, s = cos(pose.theta()), sin(pose.theta())
+        to_parent = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+        ros = np.zeros((6, 6))
+        ros[np.ix_(self.used, self.used)] = to_parent @ covariance @ to_parent.T
+        return ros
 
     def twist_covariance(self, ros: Array) -> Array:
         return np.asarray(ros.reshape(6, 6)[np.ix_(self.used, self.used)])
@@ -237,6 +248,9 @@ class Spatial:
 
     def covariance(self, ros: Array, pose: Pose) -> Array:
         return covariance_from_ros(ros.reshape(6, 6), pose.rotation().matrix())
+
+    def covariance_to_ros(self, covariance: Array, pose: Pose) -> Array:
+        return covariance_to_ros(covariance, pose.rotation().matrix())
 
     def twist_covariance(self, ros: Array) -> Array:
         return np.roll(ros.reshape(6, 6), (3, 3), axis=(0, 1))

@@ -29,10 +29,12 @@ RequestName = Literal["snapshot", "save", "finish"]
 
 @dataclass(frozen=True, slots=True)
 class Report:
-    """What changed since the last one. applied: id of the newest row that was read. update_ms: median and p99."""
+    """What changed since the last one. applied: id of the newest row that was read. covariance: of the newest keyframe's pose, 36
+    numbers in ROS order; None without updates, or when it is not determined. update_ms: median and p99."""
 
     applied: int
     updates: tuple[Update, ...]
+    covariance: tuple[float, ...] | None
     decisions: tuple[Decision, ...]
     factors: int
     update_ms: tuple[float, float]
@@ -140,12 +142,22 @@ class _Worker:
         report = Report(
             self._inputs.applied,
             updates,
+            self._covariance(updates[-1]) if updates else None,
             tuple(decisions),
             len(self._run.backend.solver.factors),
             self._run.seconds.recent(),
             resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
         )
         self._pipe.send(report)
+
+    def _covariance(self, update: Update) -> tuple[float, ...] | None:
+        backend = self._run.backend
+        try:
+            tangent = backend.estimate.covariance([update.keyframe.pose])
+        except SlamError:
+            return None
+        ros = backend.space.covariance_to_ros(tangent, backend.space.pose(update.pose))
+        return tuple(ros.ravel().tolist())
 
     def _answer(self, request: Request) -> Any:
         if request.name == "snapshot":

@@ -1,0 +1,49 @@
+"""What the node's callbacks read: the newest answers of the worker, written by other threads."""
+
+import threading
+from collections import deque
+from collections.abc import Callable
+
+from ..core.backend import Update
+from ..core.graph import Decision
+from ..core.trajectory import Snapshot
+from ..io.worker import Report
+
+DECISIONS = 10_000  # the newest that can be asked for by id
+
+
+class State:
+    """Thread-safe by replacing whole values. changed: called after each report, from the reading thread."""
+
+    def __init__(self, changed: Callable[[], None]) -> None:
+        self._changed = changed
+        self._lock = threading.Lock()
+        self.report: Report | None = None
+        self.update: Update | None = None
+        self.covariance: tuple[float, ...] | None = None  # 36, ROS order, of the newest keyframe
+        self.snapshot: Snapshot | None = None
+        self.decided: dict[str, Decision] = {}
+        self.refused: dict[tuple[str, str], int] = {}  # (source, stage/reason) -> count
+        self.incidents: deque[str] = deque(maxlen=100)
+        self._untold: list[Decision] = []
+
+    def take(self, report: Report) -> None:
+        with self._lock:
+            self.report = report
+            if report.updates:
+                self.update, self.covariance = report.updates[-1], report.covariance
+            for decision in report.decisions:
+                self._untold.append(decision)
+                self.decided[decision.id] = decision
+                if decision.verdict in ("refused", "removed"):
+                    rule = (decision.source, f"{decision.stage}/{decision.reason}")
+                    self.refused[rule] = self.refused.get(rule, 0) + decision.count
+            while len(self.decided) > DECISIONS:
+                del self.decided[next(iter(self.decided))]
+        self._changed()
+
+    def untold_decisions(self) -> list[Decision]:
+        """Those that have not been published yet; each is handed out once."""
+        with self._lock:
+            untold, self._untold = self._untold, []
+        return untold
