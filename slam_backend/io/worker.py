@@ -30,7 +30,8 @@ RequestName = Literal["snapshot", "save", "finish"]
 @dataclass(frozen=True, slots=True)
 class Report:
     """What changed since the last one. applied: id of the newest row that was read. covariance: of the newest keyframe's pose, 36
-    numbers in ROS order; None without updates, or when it is not determined. update_ms: median and p99."""
+    numbers in ROS order; None without updates, or when it is not determined. update_ms: median and p99.
+    """
 
     applied: int
     updates: tuple[Update, ...]
