@@ -3,7 +3,6 @@
 import json
 from collections.abc import Iterable
 from hashlib import sha256
-from struct import pack
 
 import gtsam
 
@@ -17,13 +16,13 @@ def run_hash(
 ) -> str:
     """SHA-256 over the factors, the decisions and the final poses.
 
-    A factor counts by its id, its variables and its error at the final values, which holds its measurement and noise to
-    the last bit. Decisions are sorted, since those about single records stand in the order of arrival.
+    A factor counts by its id, its variables, and its whitened Jacobian and residual at the final values, which hold its
+    measurement and its noise. Decisions are sorted, since those about single records stand in the order of arrival.
     """
     digest = sha256()
     for factor in sorted(factors, key=lambda factor: factor.id):
         digest.update(f"{factor.id} {factor.kind} {factor.keys} ".encode())
-        digest.update(pack("<d", factor.factor.error(values)))
+        digest.update(factor.factor.linearize(values).augmentedJacobian().tobytes())
     for line in sorted(json.dumps(as_json(decision)) for decision in decisions):
         digest.update(line.encode())
     digest.update(sevens.astype("<f8").tobytes())
