@@ -17,6 +17,8 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 
 from .errors import BadConfig
 
+LIVE: dict[str, Any] = {"live": True}  # settings that a running node takes; all others are read-only there
+
 KernelName = Literal["none", "huber", "cauchy", "tukey", "geman_mcclure", "dcs"]
 
 
@@ -60,6 +62,13 @@ class Isam2(Section):
     factorization: Literal["auto", "cholesky", "qr"] = Field(
         default="auto", description="auto: Cholesky, and QR for the rest of the run once Cholesky has failed"
     )
+
+
+class PathOutput(Section):
+    """The node's ~/path: for eyes; complete trajectories go on ~/trajectory."""
+
+    poses: int = Field(10_000, ge=1, description="newest keyframes in it", json_schema_extra=LIVE)
+    rate: float = Field(1.0, gt=0, le=50, description="Hz at most", json_schema_extra=LIVE)
 
 
 class Source(Section):
@@ -150,6 +159,19 @@ class Config(Section):
     keyframes: Keyframes = Keyframes()
     settle: Settle = Settle()
     isam2: Isam2 = Isam2()
+    map_frame: str = Field(
+        "map", description="name of the frame of the optimized trajectory, in what the node publishes"
+    )
+    odom_frame: str = Field("odom", description="name of the odometry's frame, in what the node publishes")
+    data_dir: str = Field(
+        "", description="where the node keeps its journal and saved runs; empty: ~/.ros/slam_backend/<node>"
+    )
+    autostart: bool = Field(default=True, description="the node configures and activates itself")
+    on_clock_jump: Literal["reset", "ignore"] = Field(
+        default="ignore",
+        description="when stamps of the driving source jump back (a looped bag): start anew, or refuse them",
+    )
+    path: PathOutput = PathOutput()
     extrinsics: Mapping[str, tuple[float, float, float, float, float, float]] = Field(
         default_factory=dict,
         description="frame: x, y, z (m), roll, pitch, yaw (rad) of that sensor in the base",
