@@ -39,8 +39,9 @@ def noise_of(covariance: Array, config: Observing | None = None) -> Any:
     variances = np.diag(covariance)
     clipped = np.clip(variances, SMALLEST_SIGMA**2, LARGEST_SIGMA**2)
     if (clipped != variances).any():
-        scale = np.sqrt(clipped / variances)
+        scale = np.sqrt(clipped / np.maximum(variances, np.finfo(float).tiny))
         covariance = covariance * scale[:, None] * scale
+        np.fill_diagonal(covariance, clipped)  # a variance of zero as well
     return with_kernel(gtsam.noiseModel.Gaussian.Covariance(covariance), config)
 
 
