@@ -10,6 +10,7 @@ from ..core.sensors.cloud import columns
 from ..core.sensors.odometry import DECODERS as ODOMETRY
 from .bags import Bag
 from .inputs import EDGES, LANDMARKS, BagInputs, GraphInput
+from .records import Record
 
 ENOUGH = 200  # odometry messages that are looked at to tell whether the robot moves in a plane
 TRUTH = (
@@ -29,8 +30,7 @@ def discover(inputs: BagInputs | GraphInput) -> tuple[Config, list[str]]:
     kinds, notes = _kinds_of(inputs)
     sources: dict[str, dict[str, Any]] = {}
     for topic, kind in kinds.items():
-        name = topic.strip("/").replace("/", "_") or kind
-        sources[name] = {"kind": kind, "topic": topic}
+        sources[name_of(topic)] = {"kind": kind, "topic": topic}
     if not any(kind in ("odometry", "relative") for kind in kinds.values()):
         where = ", ".join(str(path) for path in inputs.paths)
         has = (
@@ -42,6 +42,16 @@ def discover(inputs: BagInputs | GraphInput) -> tuple[Config, list[str]]:
     space = "2d" if _planar(inputs, kinds) else "3d"
     notes.append(f"space {space}: the poses {'lie in a plane' if space == '2d' else 'leave the plane'}")
     return config_from({"space": space, "sources": list(sources), **sources}), notes
+
+
+def is_truth(topic: str) -> bool:
+    """Whether a topic's name says that it is ground truth, which must not become input."""
+    return any(part in topic.lower() for part in TRUTH)
+
+
+def name_of(topic: str) -> str:
+    """The name of a source that was found by its topic."""
+    return topic.strip("/").replace("/", "_") or "source"
 
 
 def _of_graph(inputs: GraphInput) -> Config:
@@ -56,10 +66,10 @@ def _kinds_of(inputs: BagInputs) -> tuple[dict[str, str], list[str]]:
     kinds: dict[str, str] = {}
     notes: list[str] = []
     for topic, (first, bag) in _first_messages(inputs).items():
-        if any(part in topic.lower() for part in TRUTH):
+        if is_truth(topic):
             notes.append(f"{topic} is taken for ground truth and left aside")
             continue
-        kind = _kind(bag, first)
+        kind = kind_of(first, bag.typestore)
         if kind is not None:
             kinds[topic] = kind
     odometries = [topic for topic, kind in kinds.items() if kind == "odometry"]
@@ -87,10 +97,10 @@ def _first_messages(inputs: BagInputs) -> dict[str, tuple[Any, Bag]]:
     return first
 
 
-def _kind(bag: Bag, record: Any) -> str | None:
+def kind_of(record: Record, typestore: Any) -> str | None:
     """What a topic is, from its first message; None when it is nothing that can be used."""
     try:
-        message: Any = bag.typestore.deserialize_cdr(record.data, record.type)
+        message: Any = typestore.deserialize_cdr(record.data, record.type)
     except Exception:  # noqa: BLE001  # any damage: the decoder will say it, message by message
         return None
     if record.type == "sensor_msgs/msg/PointCloud2":
