@@ -45,7 +45,8 @@ def write_yaml(path: Path, config: Config) -> None:
 
 
 def override(data: dict[str, Any], settings: Iterable[str]) -> dict[str, Any]:
-    """Apply `a.b=value`, the value in YAML's spelling."""
+    """With `a.b=value` applied, the value in YAML's spelling."""
+    data = dict(data)
     for setting in settings:
         name, equals, text = setting.partition("=")
         if not equals or not name:

@@ -111,9 +111,8 @@ class BagInputs(_Closing):
         for name, source in config.sources.items():
             where = ", ".join(str(path) for path in self.paths)
             if source.topic not in topics:
-                raise BadConfig(
-                    f"source '{name}': no topic '{source.topic}' in {where}{_instead(source.topic, topics)}"
-                )
+                what = f"no topic '{source.topic}' in {where}" if source.topic else "states no topic"
+                raise BadConfig(f"source '{name}': {what}{_instead(source.topic, topics)}")
             kind, has = source.kind, topics[source.topic].type
             if has not in SENSORS[kind].decoders:
                 takes = ", ".join(SENSORS[kind].decoders)
