@@ -106,24 +106,20 @@ class Track:
             grown = self._of_poses(start, end, motion)
             if grown is not None:
                 return self._floor() + grown
-        return self._floor() + self._growth(motion)
+        return self._floor() + growth(self._space, self._noise, motion)
 
     def _floor(self) -> Array:
         noise = self._noise
         return self._space.diagonal(noise.sigma_rotation_floor**2, noise.sigma_translation_floor**2)
 
-    def _growth(self, motion: Pose) -> Array:
-        noise = self._noise
-        meters, radians = self._space.size(motion)
-        return self._space.diagonal(
-            noise.sigma_rotation_per_meter**2 * meters + noise.sigma_rotation_per_radian**2 * radians,
-            noise.sigma_translation_per_meter**2 * meters + noise.sigma_translation_per_radian**2 * radians,
-        )
-
     def _filled(self, step: Array, motion: Pose) -> Array:
         """The covariance of a step with the model's growth where a variance is zero."""
         unknown = np.diag(step) <= 0
-        return step + np.diag(unknown * np.diag(self._growth(motion))) if unknown.any() else step
+        return (
+            step + np.diag(unknown * np.diag(growth(self._space, self._noise, motion)))
+            if unknown.any()
+            else step
+        )
 
     def _of_twists(self, start: int, end: int, last: Pose) -> Array:
         total = np.zeros((self._space.dimension,) * 2)
@@ -164,6 +160,15 @@ class Track:
         del self._stamps[where], self._numbers[where]
         if self._covariances:
             del self._covariances[where]
+
+
+def growth(space: Space, noise: OdometrySource, motion: Pose) -> Array:
+    """Covariance of a stretch by the model: with the distance and the angle between its ends, without the floor."""
+    meters, radians = space.size(motion)
+    return space.diagonal(
+        noise.sigma_rotation_per_meter**2 * meters + noise.sigma_rotation_per_radian**2 * radians,
+        noise.sigma_translation_per_meter**2 * meters + noise.sigma_translation_per_radian**2 * radians,
+    )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
