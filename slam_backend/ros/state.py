@@ -26,6 +26,7 @@ class State:
         self.refused: dict[tuple[str, str], int] = {}  # (source, stage/reason) -> count
         self.incidents: deque[str] = deque(maxlen=100)
         self._untold: list[Decision] = []
+        self._unshown = False
 
     def take(self, report: Report) -> None:
         with self._lock:
@@ -41,6 +42,24 @@ class State:
             while len(self.decided) > DECISIONS:
                 del self.decided[next(iter(self.decided))]
         self._changed()
+
+    def show(self, snapshot: Snapshot) -> None:
+        """A newer snapshot has come; it is to be published once."""
+        with self._lock:
+            self.snapshot, self._unshown = snapshot, True
+        self._changed()
+
+    def take_snapshot(self) -> Snapshot | None:
+        """The newest snapshot, if it has not been published yet."""
+        with self._lock:
+            unshown, self._unshown = self._unshown, False
+            return self.snapshot if unshown else None
+
+    def clear(self) -> None:
+        """A new session."""
+        with self._lock:
+            self.report = self.update = self.covariance = self.snapshot = None
+            self.decided, self.refused, self._untold = {}, {}, []
 
     def untold_decisions(self) -> list[Decision]:
         """Those that have not been published yet; each is handed out once."""
