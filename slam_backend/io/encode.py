@@ -5,7 +5,8 @@ encapsulation header; a string is its length with the final zero, then its bytes
 covariances have 36 numbers in ROS order.
 """
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass
 from struct import pack
 from typing import Any
 
@@ -17,6 +18,30 @@ from ..core.measurement import SECOND
 _ENCAPSULATION = b"\x00\x01\x00\x00"
 # sensor_msgs/PointField's numbers for the types of columns
 _DATATYPES = {"i1": 1, "u1": 2, "i2": 3, "u2": 4, "i4": 5, "u4": 6, "f4": 7, "f8": 8}
+# visualization_msgs/Marker's numbers for the shapes of many points
+_SHAPES = {"strip": 4, "lines": 5, "spheres": 7, "points": 8}
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Marker:
+    """Many points drawn as one. shape: strip, lines (each two points), spheres or points; size: m; color: r g b a, 0 to 1."""
+
+    name: str  # its namespace; the id is 0
+    shape: str
+    points: NDArray[np.float64]  # (N, 3) m
+    size: float
+    color: tuple[float, float, float, float]
+
+
+@dataclass(frozen=True, slots=True)
+class Status:
+    """A line of diagnostics. level: 0 OK, 1 WARN, 2 ERROR, 3 STALE."""
+
+    level: int
+    name: str
+    message: str
+    hardware: str
+    values: Mapping[str, str]
 
 
 class _Bytes:
@@ -100,6 +125,55 @@ def _transform(message: _Bytes, stamp: int, frame: str, child: str, seven: Array
     message.header(stamp, frame)
     message.text(child)
     message.doubles(seven, 7)
+
+
+def encode_diagnostics(stamp: int, statuses: Collection[Status]) -> bytes:
+    """diagnostic_msgs/msg/DiagnosticArray."""
+    message = _Bytes()
+    message.header(stamp, "")
+    message.integer(len(statuses))
+    for status in statuses:
+        message.add(pack("<B", status.level))
+        for text in (status.name, status.message, status.hardware):
+            message.text(text)
+        message.integer(len(status.values))
+        for key, value in status.values.items():
+            message.text(key)
+            message.text(value)
+    return message.finish()
+
+
+def encode_markers(stamp: int, frame: str, markers: Collection[Marker]) -> bytes:
+    """visualization_msgs/msg/MarkerArray; a marker without points deletes what was drawn under its name."""
+    message = _Bytes()
+    message.integer(len(markers))
+    for marker in markers:
+        message.header(stamp, frame)
+        message.text(marker.name)
+        action = 0 if len(marker.points) else 2  # add, delete
+        message.add(pack("<iii", 0, _SHAPES[marker.shape], action), 4)
+        message.doubles((0, 0, 0, 0, 0, 0, 1), 7)  # the points are in the frame itself
+        message.doubles((marker.size,) * 3, 3)
+        message.add(pack("<4f", *marker.color), 4)
+        message.add(pack("<iI?", 0, 0, False), 4)  # lifetime: for ever; not locked to a moving frame
+        message.integer(len(marker.points))
+        if len(marker.points):
+            message.doubles(marker.points, 3 * len(marker.points))
+        message.integer(0)  # colors
+        _no_texture_and_mesh(message)
+    return message.finish()
+
+
+def _no_texture_and_mesh(message: _Bytes) -> None:
+    message.text("")  # texture resource
+    message.header(0, "")  # texture: an empty CompressedImage
+    message.text("")
+    message.integer(0)
+    message.integer(0)  # texture coordinates
+    for _ in ("text", "mesh resource", "mesh file"):
+        message.text("")
+    message.integer(0)  # data of the mesh file
+    message.add(b"\0")  # whether the mesh has materials of its own
 
 
 def encode_path(frame: str, stamp: int, stamps: ArrayLike, sevens: ArrayLike) -> bytes:

@@ -7,7 +7,11 @@ import pytest
 from rosbags.typesys import Stores, get_typestore
 
 from slam_backend.io.encode import (
+    Marker,
+    Status,
     encode_cloud,
+    encode_diagnostics,
+    encode_markers,
     encode_odometry,
     encode_path,
     encode_pose_with_covariance,
@@ -165,6 +169,85 @@ def test_a_cloud_refuses_what_it_cannot_say() -> None:
         encode_cloud(STAMP, "map", {"id": np.arange(3)})
     with pytest.raises(ValueError, match=r"different lengths: \[2, 3\]"):
         encode_cloud(STAMP, "map", {"x": np.zeros(3), "y": np.zeros(2)})
+
+
+TEXTS = ["", "a", "ab", "abc", "abcd", "größe"]
+
+
+@pytest.mark.parametrize("text", TEXTS)
+@pytest.mark.parametrize("count", [0, 1, 3])
+def test_diagnostics(count, text) -> None:
+    """Every length of name and values, in one array: levels are single bytes between strings."""
+    statuses = [
+        Status(n % 4, text * n, f"m{text}", text, {f"key{k}": text + "v" * k for k in range(n)})
+        for n in range(count)
+    ]
+    message = make(
+        "diagnostic_msgs/msg/DiagnosticArray",
+        header=header(STAMP, ""),
+        status=[
+            make(
+                "diagnostic_msgs/msg/DiagnosticStatus",
+                level=s.level,
+                name=s.name,
+                message=s.message,
+                hardware_id=s.hardware,
+                values=[make("diagnostic_msgs/msg/KeyValue", key=k, value=v) for k, v in s.values.items()],
+            )
+            for s in statuses
+        ],
+    )
+    assert encode_diagnostics(STAMP, statuses) == theirs(message)
+
+
+def marker_message(frame, marker, shape):
+    time_ = {"sec": 0, "nanosec": 0}
+    nothing = make("std_msgs/msg/Header", stamp=make("builtin_interfaces/msg/Time", **time_), frame_id="")
+    empty = np.zeros(0, np.uint8)
+    return make(
+        "visualization_msgs/msg/Marker",
+        header=header(STAMP, frame),
+        ns=marker.name,
+        id=0,
+        type=shape,
+        action=0 if len(marker.points) else 2,
+        pose=pose((0, 0, 0, 0, 0, 0, 1)),
+        scale=vector((marker.size,) * 3),
+        color=make("std_msgs/msg/ColorRGBA", **dict(zip("rgba", marker.color, strict=True))),
+        lifetime=make("builtin_interfaces/msg/Duration", **time_),
+        frame_locked=False,
+        points=[pose((*p, 0, 0, 0, 1)).position for p in marker.points],
+        colors=[],
+        texture_resource="",
+        texture=make("sensor_msgs/msg/CompressedImage", header=nothing, format="", data=empty),
+        uv_coordinates=[],
+        text="",
+        mesh_resource="",
+        mesh_file=make("visualization_msgs/msg/MeshFile", filename="", data=empty),
+        mesh_use_embedded_materials=False,
+    )
+
+
+@pytest.mark.parametrize("name", TEXTS)
+@pytest.mark.parametrize("frame", FRAMES)
+def test_markers(frame, name) -> None:
+    """Several in one array, each beginning where the last one ended; one without points deletes."""
+    rng = np.random.default_rng(7)
+    shapes = {"strip": 4, "lines": 5, "spheres": 7, "points": 8}
+    markers = [
+        Marker(name * n, shape, rng.normal(size=(2 * n, 3)), 0.1 * n, (0.25, 0.5, 1.0, 1.0))
+        for n, shape in enumerate(shapes)
+    ]
+    message = make(
+        "visualization_msgs/msg/MarkerArray",
+        markers=[marker_message(frame, marker, shapes[marker.shape]) for marker in markers],
+    )
+    assert encode_markers(STAMP, frame, markers) == theirs(message)
+
+
+def test_a_marker_array_without_markers() -> None:
+    """Nothing to draw is a message too."""
+    assert encode_markers(STAMP, "map", []) == theirs(make("visualization_msgs/msg/MarkerArray", markers=[]))
 
 
 def test_a_wrong_number_of_numbers_is_refused() -> None:
