@@ -32,19 +32,11 @@ class Trajectory:
         Rows of NaN outside the trajectory.
         """
         wanted = np.asarray(stamps, dtype=np.int64)
-        if not len(self):
-            return np.full((len(wanted), 7), np.nan)
-        right = np.clip(np.searchsorted(self.stamps, wanted), 1, max(len(self.stamps) - 1, 1))
-        left = right - 1
-        if len(self.stamps) == 1:
-            right = left
-        span = np.maximum(self.stamps[right] - self.stamps[left], 1)
-        ratio = ((wanted - self.stamps[left]) / span)[:, None]
-        before, after = self.sevens[left], self.sevens[right]
-        result = np.empty((len(wanted), 7))
-        result[:, :3] = before[:, :3] + ratio * (after[:, :3] - before[:, :3])
-        result[:, 3:] = slerp(before[:, 3:], after[:, 3:], ratio)
-        result[(wanted < self.stamps[0]) | (wanted > self.stamps[-1])] = np.nan
+        result = np.full((len(wanted), 7), np.nan)
+        if len(self):
+            right = np.searchsorted(self.stamps, wanted)
+            covered = (self.stamps[0] <= wanted) & (right < len(self))
+            result[covered] = _sampled(self, wanted[covered], right[covered]).T
         return result
 
     def from_start(self, start: Array, stamp: int | None = None) -> "Trajectory":
@@ -54,18 +46,128 @@ class Trajectory:
         return Trajectory(self.stamps, seven_of_matrix(moved))
 
 
-def slerp(before: Array, after: Array, ratio: Array) -> Array:
-    """(N, 4) unit quaternions at (N, 1) ratios of the shorter arc; nearly equal ones are blended linearly."""
-    dot = np.sum(before * after, axis=1, keepdims=True)
-    after = np.where(dot < 0, -after, after)
-    angle = np.arccos(np.clip(np.abs(dot), 0.0, 1.0))
+def shaped(keyframes: Trajectory, odometry: Trajectory, stamps: ArrayLike) -> Array:
+    """(M, 7) `map_T_base` at (M,) ns: between two keyframes a and b the shape of the odometry O, bent to meet both.
+
+        X(t) = X_a (O_a^-1 O(t)) Exp(s Log((O_a^-1 O_b)^-1 X_a^-1 X_b)),   s the share of the time from a to b
+
+    The keyframes themselves are met to the bit. Where the odometry does not cover the stretch, or has no sample inside
+    it and so no shape, plain interpolation (`Trajectory.at`). Rows of NaN outside the keyframes.
+    """
+    wanted = np.asarray(stamps, dtype=np.int64)
+    rows, right, begins, ends = _with_shape(keyframes.stamps, odometry.stamps, wanted)
+    plain = np.ones(len(wanted), dtype=np.bool_)
+    plain[rows] = False
+    result = np.empty((len(wanted), 7))
+    result[plain] = keyframes.at(wanted[plain])
+    if len(rows):
+        wanted, start, end = wanted[rows], keyframes.stamps[right - 1], keyframes.stamps[right]
+        at_start, at_end = _sampled(odometry, start, begins), _sampled(odometry, end, ends)
+        here = _sampled(odometry, wanted, np.searchsorted(odometry.stamps, wanted))
+        first, second = _columns(keyframes.sevens, right - 1), _columns(keyframes.sevens, right)
+        missing = _between(_between(at_start, at_end), _between(first, second))
+        bent = _part(missing, (wanted - start) / (end - start))
+        result[rows] = _composed(first, _composed(_between(at_start, here), bent)).T
+    return result
+
+
+def _with_shape(keyframes: Stamps, odometry: Stamps, wanted: Stamps) -> Stamps:
+    """(4, K): which stamps lie on a stretch that the odometry covers and has a sample inside of; the keyframe at the
+    stretch's end; where searchsorted has the stretch's start and end in the odometry.
+    """
+    right = np.searchsorted(keyframes, wanted)
+    rows = np.flatnonzero((right > 0) & (right < len(keyframes)))
+    right = right[rows]
+    start, end = keyframes[right - 1], keyframes[right]
+    begins, ends = np.searchsorted(odometry, start), np.searchsorted(odometry, end)
+    good = np.flatnonzero((wanted[rows] < end) & (begins < ends) & (ends < len(odometry)))
+    good = good[start[good] >= odometry[:1]]  # [:1]: there may be none
+    own = odometry[begins[good]] == start[good]  # the sample found is the start's, not one inside
+    good = good[begins[good] + own < ends[good]]
+    return np.stack([rows[good], right[good], begins[good], ends[good]])
+
+
+# Poses as columns, (7, N) x y z qx qy qz qw: a row of each number is several times faster than 4x4 matrices.
+
+
+def _sampled(track: Trajectory, wanted: Stamps, right: Stamps) -> Array:
+    """(7, N) at stamps that the track covers and searchsorted has at `right`: positions on straight lines, rotations on
+    the shorter arcs.
+    """
+    result, after = _columns(track.sevens, right), track.stamps[right]
+    if len(rows := np.flatnonzero(after != wanted)):
+        right, wanted, after = right[rows], wanted[rows], after[rows]
+        before = track.stamps[right - 1]
+        ratio = (wanted - before) / (after - before)
+        result[:, rows] = _blended(_columns(track.sevens, right - 1), result[:, rows], ratio)
+    return result
+
+
+def _columns(sevens: Array, rows: Stamps) -> Array:
+    return np.ascontiguousarray(np.take(sevens, rows, axis=0).T)
+
+
+def _blended(first: Array, second: Array, ratio: Array) -> Array:
+    """Rotations that are nearly equal are blended linearly: their arc has no sine to divide by."""
+    position = first[:3] + ratio * (second[:3] - first[:3])
+    dot = _dot(first[3:], second[3:]) + first[6] * second[6]
+    angle = np.arccos(np.minimum(np.abs(dot), 1.0))
     sine = np.sin(angle)
     near = sine < 1e-6
     safe = np.where(near, 1.0, sine)
-    first = np.where(near, 1 - ratio, np.sin((1 - ratio) * angle) / safe)
-    second = np.where(near, ratio, np.sin(ratio * angle) / safe)
-    blended = first * before + second * after
-    return np.asarray(blended / np.linalg.norm(blended, axis=1, keepdims=True))
+    weight = np.where(near, 1 - ratio, np.sin((1 - ratio) * angle) / safe)
+    other = np.where(near, ratio, np.sin(ratio * angle) / safe) * np.where(dot < 0, -1.0, 1.0)
+    blended = weight * first[3:] + other * second[3:]
+    blended /= np.sqrt(_dot(blended, blended) + blended[3] ** 2)
+    return np.concatenate([position, blended])
+
+
+def _composed(first: Array, second: Array) -> Array:
+    """a_T_b and b_T_c to a_T_c."""
+    return np.concatenate([first[:3] + _turned(first[3:], second[:3]), _times(first[3:], second[3:])])
+
+
+def _between(first: Array, second: Array) -> Array:
+    """c_T_a and c_T_b to a_T_b."""
+    back = np.stack([-first[3], -first[4], -first[5], first[6]])
+    return np.concatenate([_turned(back, second[:3] - first[:3]), _times(back, second[3:])])
+
+
+def _part(poses: Array, share: Array) -> Array:
+    """Exp(share Log(pose)): (7, N) along the screws that lead to the poses, shares (N,) of the way."""
+    position, quaternion = poses[:3], np.where(poses[6] < 0, -poses[3:], poses[3:])
+    sine = np.sqrt(_dot(quaternion, quaternion))
+    still = sine == 0
+    sine[still] = 1.0
+    half = np.arctan2(sine, quaternion[3])  # of the angle; meaningless where nothing turns
+    axis = quaternion[:3] / sine
+    s, c = np.sin(half * share), np.cos(half * share)
+    # V^-1 of Log, then s V(s) of Exp, for the parts of the translation along and across the axis
+    along = axis * _dot(axis, position)
+    across = half * (quaternion[3] / sine * (position - along) - _cross(axis, position))
+    moved = share * along + (s / half) * (c * across + s * _cross(axis, across))
+    moved[:, still] = share[still] * position[:, still]
+    c[still] = 1.0
+    return np.concatenate([moved, axis * s, c[None]])
+
+
+def _turned(q: Array, v: Array) -> Array:
+    """(3, N) vectors rotated by (4, N) unit quaternions."""
+    twice = 2 * _cross(q[:3], v)
+    return np.asarray(v + q[3] * twice + _cross(q[:3], twice))
+
+
+def _times(p: Array, q: Array) -> Array:
+    vector = p[3] * q[:3] + q[3] * p[:3] + _cross(p[:3], q[:3])
+    return np.concatenate([vector, (p[3] * q[3] - _dot(p[:3], q[:3]))[None]])
+
+
+def _cross(a: Array, b: Array) -> Array:
+    return np.stack([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])
+
+
+def _dot(a: Array, b: Array) -> Array:
+    return np.asarray(a[0] * b[0] + a[1] * b[1] + a[2] * b[2])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -91,3 +193,7 @@ class Snapshot:
     def poses(self) -> Array:
         """(N, 4, 4) map_T_base"""
         return self.trajectory.poses
+
+    def at(self, stamps: ArrayLike) -> Array:
+        """(M, 7) `map_T_base` at (M,) ns, between keyframes in the shape of the odometry: see `shaped`."""
+        return shaped(self.trajectory, self.odometry, stamps)
