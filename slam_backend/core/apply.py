@@ -107,7 +107,8 @@ class Applier:
                     raise
                 delta, whole = without(delta, {factor.id for factor in bad}), False
                 if not delta.add:
-                    self.decisions += [_kept(self._solver.factors[id_], failure) for id_ in delta.remove]
+                    kept = self._solver.factors
+                    self.decisions += [_kept(kept[id_], failure) for id_ in delta.remove if id_ in kept]
                     return False
                 continue
             finally:

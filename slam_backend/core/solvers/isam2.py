@@ -27,6 +27,7 @@ from ..space import Space
 SETTLED = 1e-10  # largest change of a variable (m, rad) at which a rebuild is done
 ROUNDING = 1e-10  # relative change of the cost at which a step that no longer shrinks is only rounding
 ROUNDS = 30  # of re-linearization in a rebuild
+AFLOAT = 1e14  # m^2 or rad^2; of a variable that nothing holds, rounding leaves some 1e28
 JOINING = frozenset({"loop", "pose"})  # kinds of factors after which one update is not enough
 
 _Failures = (
@@ -105,6 +106,13 @@ class Isam2:
             )
             if not all(map(isfinite, found)):
                 raise RuntimeError(f"estimate is not finite near variable {gtsam.DefaultKeyFormatter(key)}")
+        self._check_held(delta)
+
+    def _check_held(self, delta: Delta) -> None:
+        """What a removed factor held must be held by others: rounding can hide from both factorizations that it is not."""
+        for key in {key for id_ in delta.remove for key in self.factors[id_].keys}:
+            if not np.diag(self._isam.marginalCovariance(key)).max() < AFLOAT:
+                raise RuntimeError(f"nothing holds variable {gtsam.DefaultKeyFormatter(key)}")
 
     def _commit(self, delta: Delta) -> None:
         for id_ in delta.remove:
@@ -131,6 +139,7 @@ class Isam2:
             self._qr = qr or self._config.factorization == "auto"
             try:
                 self._isam, self._slots = self._climb(list(self._after(delta)), values)
+                self._check_held(delta)
             except _Failures:
                 guilty = self._unsolvable(delta, before)
             else:
@@ -138,7 +147,8 @@ class Isam2:
                 return
         self._qr = qr
         self._isam, self._slots = self._climb(list(self.factors.values()), before)
-        self._note("rolled_back", error, _stamp(delta), f"; without {', '.join(guilty)}")
+        without = guilty or tuple(f"removing {id_}" for id_ in delta.remove)
+        self._note("rolled_back", error, _stamp(delta), f"; without {', '.join(without)}")
         raise SolverFailure(_short(error), guilty) from None
 
     def _refuge(self, fresh: Iterable[int]) -> gtsam.Values:
@@ -149,6 +159,9 @@ class Isam2:
                 values.erase(key)
         if values.size() and not np.isfinite(values.localCoordinates(values).vector()).all():
             return _values(self._guesses)
+        for key, guess in self._guesses.items():
+            if not values.exists(key):  # iSAM2 forgets a variable with its last factor
+                values.insert(key, guess)
         return values
 
     def _after(self, delta: Delta) -> Iterable[Factor]:
@@ -157,16 +170,21 @@ class Isam2:
         yield from delta.add
 
     def _climb(self, factors: Sequence[Factor], values: gtsam.Values) -> Built:
-        """Gauss-Newton; then batch Levenberg-Marquardt and whatever is near its optimum. Raises what the last rung raised."""
-        try:
-            return self._settled(factors, values)
-        except _Failures:
-            params = gtsam.LevenbergMarquardtParams()
-            found = gtsam.LevenbergMarquardtOptimizer(_graph(factors), values, params).optimize()
+        """Gauss-Newton, with QR if it must be; then batch Levenberg-Marquardt and whatever is near its optimum. Raises what
+        the last rung raised.
+        """
+        for qr in dict.fromkeys((self._qr, True)):
+            self._qr = qr
             try:
-                return self._settled(factors, found)
-            except Unsettled:
-                return self._built(factors, found)
+                return self._settled(factors, values)
+            except _Failures:
+                continue
+        params = gtsam.LevenbergMarquardtParams()
+        found = gtsam.LevenbergMarquardtOptimizer(_graph(factors), values, params).optimize()
+        try:
+            return self._settled(factors, found)
+        except Unsettled:
+            return self._built(factors, found)
 
     def _settled(self, factors: Iterable[Factor], values: gtsam.Values) -> Built:
         """A new ISAM2 with fresh linearization points, renewed until the largest step is below SETTLED."""

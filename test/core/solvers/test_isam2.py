@@ -58,7 +58,7 @@ def loop(name, i, j, measured, noise=NOISE):
     return Factor(f"loops/{name}/0", "loop", Between(X(i), X(j), measured, noise), (X(i), X(j)), j)
 
 
-def driven(count=40, factorization="auto"):
+def driven(count=40, factorization="auto", good=True):
     """A chain of poses on a circle with one good loop, measured with noise; the solver and its estimate."""
     config = config_from(
         {
@@ -77,6 +77,8 @@ def driven(count=40, factorization="auto"):
         measured = gtsam.Pose2(1 + rng.normal(0, 0.05), rng.normal(0, 0.05), 0.1 + rng.normal(0, 0.02))
         guess = estimate.pose(X(k - 1)).compose(measured)
         estimate = solver.update(Delta((step(k, measured=measured),), values={X(k): guess}))
+    if not good:
+        return solver, estimate
     truth = gtsam.Pose2.Expmap([30, 0, 3.0])
     return solver, solver.update(Delta((loop("good", 2, 32, truth),)))
 
@@ -180,6 +182,32 @@ def test_a_failed_move_of_what_exists_loses_nothing():
     assert away(solver, estimate) < 1e-9
 
 
+@pytest.mark.parametrize("factorization", ["auto", "qr"])
+@pytest.mark.parametrize("what", ["gauge/0/0", "wheels/7/0", "trees/5/0"])
+def test_a_removal_that_leaves_something_afloat_is_refused(what, factorization):
+    """The gauge, the only edge to the poses behind, the only sighting of a landmark."""
+    solver, estimate = driven(8, factorization=factorization, good=False)
+    ranged = gtsam.BearingRangeFactor2D(X(5), L(0), gtsam.Rot2(0.3), 5.0, gtsam.noiseModel.Unit.Create(2))
+    guess = {L(0): estimate.pose(X(5)).transformFrom(np.array([5.0, 1.5]))}
+    estimate = solver.update(Delta((Factor("trees/5/0", "landmark", ranged, (X(5), L(0)), 5),), values=guess))
+    with pytest.raises(SolverFailure):
+        solver.update(Delta(remove=(what,)))
+    assert what in solver.factors
+    assert estimate.values().size() == 9
+    assert away(solver, estimate) < 1e-9
+    (incident,) = solver.incidents()
+    assert f"without removing {what}" in incident.detail
+
+
+def test_a_factor_that_is_not_needed_can_be_removed():
+    solver, estimate = driven()
+    estimate = solver.update(Delta(remove=("loops/good/0",)))
+    assert "loops/good/0" not in solver.factors
+    assert not solver.incidents()
+    estimate = solver.polish()
+    assert away(solver, estimate) < 1e-9
+
+
 def test_a_linearization_point_that_is_lost_is_replaced_by_first_guesses():
     solver, estimate = driven()
     solver._isam = solver._empty()
@@ -198,6 +226,17 @@ def test_one_bad_factor_does_not_cost_the_faster_factorization():
     with pytest.raises(SolverFailure):
         solver.update(Delta((Factor("loops/bad/0", "loop", BAD["NaN"], (X(3), X(30)), 30),)))
     assert not solver._qr
+
+
+def test_a_bad_factor_on_a_graph_that_only_qr_can_rebuild():
+    """The chain is one that Cholesky gives up on, should it have to start from the beginning."""
+    backend, _ = corridor("2d", 1400)
+    solver, estimate = backend.solver, backend.estimate
+    solver._qr = False
+    with pytest.raises(SolverFailure) as failure:
+        solver.update(Delta((Factor("loops/bad/0", "loop", BAD["NaN"], (X(3), X(30)), 30),)))
+    assert failure.value.guilty == ("loops/bad/0",)
+    np.testing.assert_allclose(estimate.pose(X(1399)).x(), 1399, atol=1e-6)
 
 
 def test_polish_survives_what_does_not_settle(monkeypatch):
