@@ -27,15 +27,12 @@ class Diagnostics:
     def publish(
         self, flows: Mapping[str, Flow], feeder: Feeder | None, journal: Journal | None, config: Config
     ) -> None:
-        name = self._node.get_name()
+        name, resolve = self._node.get_name(), self._node.resolve_topic_name
         statuses = [
-            Status(
-                *self._source(source, flows.get(self._node.resolve_topic_name(config.sources[source].topic))),
-                f"{name}: {source}",
-            )
-            for source in config.sources
+            _status(f"{name}: {source}", *self._source(source, flows.get(resolve(setting.topic))))
+            for source, setting in config.sources.items()
         ]
-        statuses.append(Status(*self._worker(feeder, journal), f"{name}: solver"))
+        statuses.append(_status(f"{name}: solver", *self._worker(feeder, journal)))
         stamp = self._node.get_clock().now().nanoseconds
         self._publisher.publish(encode_diagnostics(stamp, statuses))
 
@@ -86,3 +83,7 @@ class Diagnostics:
         if feeder.backlog > BEHIND:
             return WARN, f"the worker is {feeder.backlog} records behind", values
         return OK, "solving", values
+
+
+def _status(name: str, level: int, message: str, values: Mapping[str, str]) -> Status:
+    return Status(level, name, message, "", values)

@@ -33,7 +33,7 @@ from ..io.typestore import typestore_of
 from .diagnostics import Diagnostics
 from .inputs import Inputs
 from .outputs import Outputs
-from .parameters import changed, config_of, declare
+from .parameters import changed, config_of, declare, overrides
 from .pose import Odometer
 from .services import Services
 from .state import State
@@ -68,11 +68,8 @@ class BackendNode(LifecycleNode):
     @property
     def data_dir(self) -> Path:
         """Of this node alone; nothing is written outside of it."""
-        if self.config.data_dir:
-            return Path(self.config.data_dir).expanduser()
-        return (
-            Path.home() / ".ros/slam_backend" / self.get_fully_qualified_name().strip("/").replace("/", "_")
-        )
+        name = str(self.get_fully_qualified_name()).strip("/").replace("/", "_")
+        return Path(self.config.data_dir or f"~/.ros/slam_backend/{name}").expanduser()
 
     # -- lifecycle -------------------------------------------------------------------------------
 
@@ -330,11 +327,14 @@ def _set_aside(journal: Path) -> None:
         raise BadFile(f"{journal}: cannot be set aside: {error}") from None
 
 
-def main(arguments: list[str] | None = None) -> int:
-    """Run the node until it is told to stop; exit code 2 with one line for a wrong configuration."""
+def main(arguments: list[str] | None = None, config: Config | None = None) -> int:
+    """Run the node until it is told to stop; exit code 2 with one line for a wrong configuration.
+
+    config: what the parameters start from; ROS arguments override it.
+    """
     rclpy.init(args=arguments)
     try:
-        node = BackendNode()
+        node = BackendNode(parameter_overrides=overrides(config) if config else [])
     except SlamError as error:
         sys.stderr.write(f"slam-backend: {error}\n")
         rclpy.try_shutdown()

@@ -32,6 +32,14 @@ def config_of(node: Node) -> Config:
     return config_from(nested, "parameters")
 
 
+def overrides(config: Config) -> list[Parameter]:
+    """A configuration as the parameters that a node is started with."""
+    found = [
+        (name, value) for name, (value, _) in settings(config).items() if value is not None and value != []
+    ]
+    return [Parameter(name, value=value) for name, value in found]
+
+
 def declare(node: Node, config: Config) -> None:
     """Declare what was not given, and describe all: type, range, unit, sentence."""
     for name, (value, field) in settings(config).items():

@@ -1,0 +1,196 @@
+"""~/get_trajectory, served by a process of its own: an answer of 10,000 poses would stop the node's callbacks for long.
+
+The process has a context and a node of its own. Asked for a trajectory, it asks the node's process for the newest
+snapshot over a pipe; there a thread answers, with arrays that are written as they lie in memory.
+"""
+
+import math
+import multiprocessing
+import pickle
+import threading
+from collections.abc import Callable
+from multiprocessing.connection import Connection
+from queue import SimpleQueue
+from typing import Any
+
+import numpy as np
+
+from ..core.errors import BadMessage
+from ..core.measurement import SECOND, Array, stamp_of
+from ..core.trajectory import Snapshot, Stamps
+
+MOST = 200_000  # poses in one answer; a receiver in Python needs minutes for more
+PAUSE = 1.0  # s before a process that ended is started anew
+Newest = Callable[[], Snapshot | None]
+
+
+class Answers:
+    """Keeps the process alive and gives it snapshots.
+
+    service: its full name. newest: called in a thread of its own for each request, may take a moment. log: told in
+    words when the process was lost.
+    """
+
+    def __init__(
+        self, service: str, namespace: str, frame: str, newest: Newest, log: Callable[[str], object]
+    ) -> None:
+        self._arguments = (service, namespace, frame)
+        self._newest, self._log = newest, log
+        self._stop = threading.Event()
+        self._start()
+        threading.Thread(target=self._keep, name="answers", daemon=True).start()
+
+    @property
+    def pid(self) -> int | None:
+        return self._process.pid
+
+    def close(self) -> None:
+        """End the process; safe to call twice."""
+        self._stop.set()
+        self._process.terminate()
+        self._process.join()
+
+    def _start(self) -> None:
+        context = multiprocessing.get_context("spawn")  # a forked copy of DDS's threads would deadlock
+        self._pipe, theirs = context.Pipe()
+        self._process = context.Process(target=serve, args=(theirs, *self._arguments), daemon=True)
+        self._process.start()
+        theirs.close()
+
+    def _keep(self) -> None:
+        """Until told to stop: answer the process, and start another one where it ended."""
+        while True:
+            try:
+                while True:
+                    self._pipe.recv_bytes()
+                    _send(self._pipe, self._newest())
+            except (EOFError, OSError):
+                self._pipe.close()
+            if self._stop.wait(PAUSE):
+                return
+            self._process.join()
+            self._log(
+                f"the process of get_trajectory ended with code {self._process.exitcode}; starting another"
+            )
+            self._start()
+
+
+def _send(pipe: Connection, snapshot: Snapshot | None) -> None:
+    """Arrays beside the pickle: they are written without a copy, and without the GIL."""
+    buffers: list[pickle.PickleBuffer] = []
+    head = pickle.dumps(snapshot, protocol=5, buffer_callback=buffers.append)
+    pipe.send((head, len(buffers)))
+    for buffer in buffers:
+        pipe.send_bytes(buffer.raw())
+
+
+def _receive(pipe: Connection) -> Snapshot | None:
+    head, count = pipe.recv()
+    snapshot: Snapshot | None = pickle.loads(head, buffers=[pipe.recv_bytes() for _ in range(count)])  # noqa: S301  # our own process
+    return snapshot
+
+
+# -- in the process ----------------------------------------------------------------------------------
+
+
+def selected(snapshot: Snapshot | None, start: int, goal: int, period: float) -> tuple[Stamps, Array]:
+    """(N,) stamps and (N, 7) `map_T_base` from `start` to `goal` (ns; 0: open), both included.
+
+    period: 0 for the keyframes, else s between poses, in the shape of the odometry. BadMessage if it cannot be.
+    """
+    if not (period >= 0 and math.isfinite(period)):
+        raise BadMessage(f"tolerance is the resample period in seconds: {period:g} is none")
+    if snapshot is None or not len(snapshot.trajectory):
+        return np.zeros(0, dtype=np.int64), np.zeros((0, 7))
+    stamps = snapshot.stamps
+    first, last = max(start, int(stamps[0])), min(goal or int(stamps[-1]), int(stamps[-1]))
+    if period == 0:
+        rows = slice(np.searchsorted(stamps, first), np.searchsorted(stamps, last, side="right"))
+        return stamps[rows], snapshot.trajectory.sevens[rows]
+    step = max(round(period * SECOND), 1)
+    if (last - first) // step >= MOST:
+        raise BadMessage(f"a period of {period:g} s makes more than {MOST:,} poses; ask for less")
+    wanted = np.arange(first, last + 1, step, dtype=np.int64)
+    return wanted, snapshot.at(wanted)
+
+
+class Plans:
+    """nav_msgs PoseStamped objects, reused from answer to answer: filling one is several times faster than making it."""
+
+    def __init__(self, frame: str) -> None:
+        self._frame = frame
+        self._pool: list[Any] = []
+
+    def fill(self, stamps: Stamps, sevens: Array) -> list[Any]:
+        """A list of the N poses, valid until the next call."""
+        from geometry_msgs.msg import PoseStamped
+
+        for _ in range(len(stamps) - len(self._pool)):
+            new = PoseStamped()
+            new.header.frame_id = self._frame
+            self._pool.append(new)
+        poses = self._pool[: len(stamps)]
+        seconds, nanoseconds = (part.tolist() for part in np.divmod(stamps, SECOND))
+        for pose, sec, nanosec, seven in zip(poses, seconds, nanoseconds, sevens.tolist(), strict=True):
+            stamp, position, orientation = pose.header.stamp, pose.pose.position, pose.pose.orientation
+            stamp.sec, stamp.nanosec = sec, nanosec
+            position.x, position.y, position.z = seven[:3]
+            orientation.x, orientation.y, orientation.z, orientation.w = seven[3:]
+        return poses
+
+
+def serve(pipe: Connection, service: str, namespace: str, frame: str) -> None:
+    """The process: answers until the node's end of the pipe is closed."""
+    import signal
+
+    import rclpy
+    from nav_msgs.srv import GetPlan
+    from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+    from rclpy.node import Node
+    from rclpy.signals import SignalHandlerOptions
+
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the node's affair: the pipe will tell
+    context = rclpy.Context()
+    rclpy.init(context=context, signal_handler_options=SignalHandlerOptions.NO)
+    # hidden by its underscore; the node's arguments do not reach it: the name of the service is resolved already
+    name = "_" + service.strip("/").replace("/", "_")
+    node = Node(name, namespace=namespace, context=context, use_global_arguments=False, enable_rosout=True,
+                start_parameter_services=False)  # fmt: skip
+    snapshots: SimpleQueue[Snapshot | None] = SimpleQueue()
+    plans = Plans(frame)
+
+    def listen() -> None:
+        try:
+            while True:
+                snapshots.put(_receive(pipe))
+        except (EOFError, OSError):
+            context.try_shutdown()
+
+    def answer(request: Any, response: Any) -> Any:
+        response.plan.header.frame_id = frame
+        try:
+            asked = request.start.header.frame_id
+            if asked not in ("", frame):
+                what = "not possible yet" if asked.startswith(f"{frame}@") else "no frame of a trajectory"
+                raise BadMessage(f"'{asked}' is {what}; there is '{frame}'")
+            pipe.send_bytes(b"")
+            snapshot = snapshots.get()
+            # the shortest decimal that is this float32: 0.1 s, not 0.10000000149
+            period = float(str(np.float32(request.tolerance)))
+            stamps, sevens = selected(snapshot, stamp_of(request.start), stamp_of(request.goal), period)
+        except BadMessage as error:
+            node.get_logger().warning(f"get_trajectory answers nothing: {error}")
+            return response
+        response.plan.poses = plans.fill(stamps, sevens)
+        if len(stamps):
+            response.plan.header.stamp = response.plan.poses[-1].header.stamp
+        return response
+
+    node.create_service(GetPlan, service, answer)
+    threading.Thread(target=listen, name="listen", daemon=True).start()
+    executor = SingleThreadedExecutor(context=context)
+    executor.add_node(node)
+    try:
+        executor.spin()
+    except ExternalShutdownException:
+        pass  # the node is gone
