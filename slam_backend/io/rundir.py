@@ -3,23 +3,31 @@
 import csv
 import json
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
+from functools import cached_property
+from io import StringIO
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
+from ..core.config import Config, OdometrySource
 from ..core.decisions import as_json
-from ..core.errors import BadFile, SlamError
+from ..core.errors import BadConfig, BadFile, SlamError
 from ..core.graph import Decision
-from ..core.space import Space
-from .configfile import write_yaml
+from ..core.measurement import Array
+from ..core.space import SPACES, Space
+from ..core.trajectory import Stamps, Trajectory
+from .configfile import load_config, write_yaml
 from .export import pose_graph
-from .formats import write_graph, write_trajectory
-from .formats.trajectory import Trajectory
+from .formats import trajectory as forms
+from .formats import tum, write_graph, write_trajectory
+from .formats.lines import read_bytes, read_text
+from .linearized import Linearized, write_linearized
 from .replay import Result
 
 FILES = ("summary.json", "config.yaml", "trajectory.tum", "odometry.tum", "online.tum", "landmarks.csv",
-         "decisions.jsonl", "graph.g2o")  # fmt: skip
+         "decisions.jsonl", "graph.g2o", "linearized.npz")  # fmt: skip
 
 
 def write_run(result: Result, out: Path) -> None:
@@ -31,10 +39,11 @@ def write_run(result: Result, out: Path) -> None:
         ("odometry", snapshot.odometry),
         ("online", result.run.online),
     ):
-        write_trajectory(out / f"{name}.tum", Trajectory(trajectory.stamps, trajectory.sevens))
+        write_trajectory(out / f"{name}.tum", forms.Trajectory(trajectory.stamps, trajectory.sevens))
     _write_landmarks(out / "landmarks.csv", result)
     _write_decisions(out / "decisions.jsonl", result)
     write_graph(out / "graph.g2o", pose_graph(result))
+    write_linearized(out / "linearized.npz", result.factors, result.values, snapshot.indices)
     write_yaml(out / "config.yaml", result.run.config)
     summary = json.dumps(result.summary, indent=1)
     (out / "summary.json").write_text(summary + "\n", encoding="utf-8")
@@ -91,3 +100,105 @@ def _covariance(result: Result, key: int, space: Space) -> Iterable[float]:
     except SlamError:
         full[:] = np.nan  # not determined: said, rather than a zero that looks certain
     return [float(value) for value in full[np.triu_indices(3)]]
+
+
+class FinishedRun:
+    """A run directory for `core.query`: each file is read once, when it is first needed.
+
+    BadFile if it is no run directory, or a file of it is missing or damaged.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        if not (path / "summary.json").exists():
+            what = (
+                "is no run directory: it has no summary.json"
+                if path.is_dir()
+                else "there is no such directory"
+            )
+            raise BadFile(f"{path}: {what}; name what `replay --out` wrote")
+        try:
+            self.summary: dict[str, Any] = json.loads(read_text(path / "summary.json"))
+            self._keyframes = int(self.summary["counts"]["keyframes"])
+        except json.JSONDecodeError as error:
+            raise BadFile(f"{path / 'summary.json'}:{error.lineno}: is damaged: {error.msg}") from None
+        except (KeyError, TypeError, ValueError):
+            raise BadFile(f"{path / 'summary.json'}: is damaged: it does not count the keyframes") from None
+
+    @cached_property
+    def config(self) -> Config:
+        try:
+            return load_config(self.path / "config.yaml")
+        except BadConfig as error:
+            raise BadFile(str(error)) from None
+
+    @property
+    def space(self) -> Space:
+        return SPACES[self.config.space]
+
+    @property
+    def noise(self) -> OdometrySource:
+        """Of the odometry; the defaults where relative poses drove the keyframes."""
+        driver = self.config.sources.get(self.config.driver or "")
+        return driver if isinstance(driver, OdometrySource) else OdometrySource()
+
+    @cached_property
+    def trajectory(self) -> Trajectory:
+        found = self._trajectory("trajectory.tum")
+        if len(found) != self._keyframes:
+            counted = f"holds {len(found)} keyframes where summary.json counts {self._keyframes}"
+            raise BadFile(f"{self.path / 'trajectory.tum'}: {counted}")
+        return found
+
+    @cached_property
+    def odometry(self) -> Trajectory:
+        return self._trajectory("odometry.tum")
+
+    @cached_property
+    def linearized(self) -> Linearized:
+        found = Linearized(self.path / "linearized.npz")
+        if len(found.indices) != self._keyframes:
+            raise BadFile(f"{self.path / 'linearized.npz'}: is of another run than summary.json")
+        return found
+
+    @property
+    def indices(self) -> Stamps:
+        return self.linearized.indices
+
+    @cached_property
+    def landmarks(self) -> Mapping[str, Array]:
+        """Positions (3,) in the map, by name."""
+        path = self.path / "landmarks.csv"
+        reader = csv.reader(StringIO(read_text(path), newline=""))
+        try:
+            next(reader)
+            return {row[0]: np.array(row[2:5], dtype=np.float64).reshape(3) for row in reader}
+        except (csv.Error, ValueError, IndexError):
+            raise BadFile(f"{path}:{reader.line_num}: is damaged: no name and position") from None
+
+    def covariance(self, index: int) -> Array:
+        return self.linearized.covariance(index)
+
+    def decision(self, identifier: str) -> Mapping[str, Any] | None:
+        """The last line of decisions.jsonl about it."""
+        path, needle = self.path / "decisions.jsonl", json.dumps(identifier).encode()
+        lines = read_bytes(path).split(b"\n")
+        for number in range(len(lines), 0, -1):
+            if needle in lines[number - 1]:
+                try:
+                    line: dict[str, Any] = json.loads(lines[number - 1])
+                except ValueError:
+                    raise BadFile(f"{path}:{number}: is damaged: no JSON") from None
+                if line.get("id") == identifier:
+                    return line
+        return None
+
+    def _trajectory(self, name: str) -> Trajectory:
+        found = tum.read(self.path / name)
+        if (back := np.flatnonzero(np.diff(found.stamps) <= 0)).size:
+            raise BadFile(
+                f"{self.path / name}: is damaged: pose {back[0] + 2} is not later than the one before"
+            )
+        sevens = found.sevens.copy()
+        sevens[:, 3:] /= np.linalg.norm(sevens[:, 3:], axis=1, keepdims=True)
+        return Trajectory(found.stamps, sevens)

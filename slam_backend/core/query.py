@@ -1,0 +1,219 @@
+"""Names to answers, of a finished run and of a living one alike.
+
+    pose@<t>            map_T_base: x y z qx qy qz qw
+    pose@<t>#cov        its covariance, 6x6 in ROS order: x y z, then rotations about the axes of the map
+    between@<a>,<b>     a_T_b: x y z qx qy qz qw
+    landmark/<id>       x y z in the map
+    decision/<factor>   the last decision about it
+
+<t>, <a>, <b> are moments: `<sec>.<nsec>`, `now` (the last keyframe) or `k<keyframe index>`.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple, Protocol
+
+import numpy as np
+
+from .config import OdometrySource
+from .errors import BadConfig, SlamError, SolverFailure
+from .geometry import covariance_to_ros, inverse_of, matrix_of, rotation_of, seven_of_matrix
+from .graph import Motion
+from .keyframes import Track
+from .measurement import Array, format_stamp, parse_stamp
+from .space import Space
+from .trajectory import Stamps, Trajectory, shaped
+
+FORMS = ("pose@<t>", "pose@<t>#cov", "between@<a>,<b>", "landmark/<id>", "decision/<factor>")
+MOMENTS = "<sec>.<nsec>, now or k<keyframe index>"
+GTSAM_AXES = {3: (3, 4, 2), 6: (0, 1, 2, 3, 4, 5)}  # of a tangent with so many, in GTSAM's order of six
+
+
+class Known(Protocol):
+    """What is asked. Each part is taken only when a name needs it.
+
+    trajectory: the keyframes. indices: (N,) theirs. odometry: from the same start. noise: of the odometry, between keyframes.
+    """
+
+    @property
+    def space(self) -> Space: ...
+
+    @property
+    def noise(self) -> OdometrySource: ...
+
+    @property
+    def trajectory(self) -> Trajectory: ...
+
+    @property
+    def indices(self) -> Stamps: ...
+
+    @property
+    def odometry(self) -> Trajectory: ...
+
+    @property
+    def landmarks(self) -> Mapping[str, Array]: ...
+
+    def covariance(self, index: int) -> Array:
+        """Of a keyframe's pose, at its tangent. SolverFailure if it is not determined."""
+        ...
+
+    def decision(self, identifier: str) -> Mapping[str, Any] | None: ...
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Answer:
+    """value: (7,), (6, 6) or (3,) numbers, or the fields of a decision; None: unknown, and `why`."""
+
+    name: str
+    value: Array | Mapping[str, Any] | None
+    why: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Moment:
+    """A stamp (ns), or the index of a keyframe; None and None: now."""
+
+    stamp: int | None = None
+    index: int | None = None
+
+
+class Question(NamedTuple):
+    name: str
+    kind: str  # pose, cov, between, landmark or decision
+    moments: tuple[Moment, ...] = ()
+    identifier: str = ""
+
+
+class Unknown(SlamError):
+    """A name that is well formed and has no answer; the text says why."""
+
+
+def question(name: str) -> Question:
+    """BadConfig if the name has none of FORMS."""
+    kind, slash, identifier = name.partition("/")
+    if slash and identifier and kind in ("landmark", "decision"):
+        return Question(name, kind, identifier=identifier)
+    kind, at, rest = name.partition("@")
+    when, hash_, what = rest.partition("#")
+    moments = when.split(",")
+    if at and kind == "pose" and len(moments) == 1 and what == ("cov" if hash_ else ""):
+        return Question(name, what or kind, (_moment(name, when),))
+    if at and kind == "between" and len(moments) == 2 and not hash_:
+        return Question(name, kind, tuple(_moment(name, text) for text in moments))
+    raise BadConfig(f"'{name}' is none of {', '.join(FORMS)}")
+
+
+def answers(names: Sequence[str], known: Known) -> list[Answer]:
+    """One for each name, in their order. BadConfig, before anything is looked up, if one of them is malformed."""
+    questions = [question(name) for name in names]
+    poses = _poses({moment for each in questions for moment in each.moments}, known)
+    return [_answer(each, known, poses) for each in questions]
+
+
+def _moment(name: str, text: str) -> Moment:
+    if text == "now":
+        return Moment()
+    try:
+        if text[:1] == "k" and text.isascii() and text[1:].isdigit():
+            return Moment(index=int(text[1:]))
+        return Moment(stamp=parse_stamp(text))
+    except ValueError:
+        raise BadConfig(f"'{name}': '{text}' is no moment: write {MOMENTS}") from None
+
+
+Posed = tuple[int, Array]  # stamp and pose (7,)
+
+
+def _poses(moments: set[Moment], known: Known) -> dict[Moment, Posed | Unknown]:
+    """All moments in one interpolation; the odometry is not even read where keyframes answer."""
+    found: dict[Moment, Posed | Unknown] = {}
+    stamps: dict[Moment, int] = {}
+    for moment in moments:
+        try:
+            stamps[moment] = _stamp(moment, known)
+        except Unknown as why:
+            found[moment] = why
+    if stamps:
+        wanted = np.array(list(stamps.values()), dtype=np.int64)
+        keyframes = known.trajectory
+        exact = np.isin(wanted, keyframes.stamps).all()
+        sevens = keyframes.at(wanted) if exact else shaped(keyframes, known.odometry, wanted)
+        found |= dict(zip(stamps, zip(wanted.tolist(), sevens, strict=True), strict=True))
+    return found
+
+
+def _stamp(moment: Moment, known: Known) -> int:
+    stamps = known.trajectory.stamps
+    if not len(stamps):
+        raise Unknown("there is no keyframe yet")
+    if moment.index is not None:
+        rows = np.flatnonzero(known.indices == moment.index)
+        if not len(rows):
+            raise Unknown(f"there is no keyframe k{moment.index}; the last is k{known.indices.max()}")
+        return int(stamps[rows[0]])
+    first, last = int(stamps[0]), int(stamps[-1])
+    stamp = last if moment.stamp is None else moment.stamp
+    if not first <= stamp <= last:
+        span = f"{format_stamp(first)} to {format_stamp(last)}"
+        raise Unknown(f"{format_stamp(stamp)} lies outside the trajectory, {span}")
+    return stamp
+
+
+def _answer(asked: Question, known: Known, poses: Mapping[Moment, Posed | Unknown]) -> Answer:
+    try:
+        return Answer(asked.name, _value(asked, known, [_posed(poses[each]) for each in asked.moments]))
+    except (Unknown, SolverFailure) as why:
+        return Answer(asked.name, None, str(why))
+
+
+def _posed(found: Posed | Unknown) -> Posed:
+    if isinstance(found, Unknown):
+        raise found
+    return found
+
+
+def _value(asked: Question, known: Known, poses: Sequence[Posed]) -> Array | Mapping[str, Any]:
+    if asked.kind == "pose":
+        return poses[0][1]
+    if asked.kind == "cov":
+        return covariance_at(known, *poses[0])
+    if asked.kind == "between":
+        a, b = (matrix_of(seven) for _, seven in poses)
+        return seven_of_matrix(inverse_of(a) @ b)
+    if asked.kind == "landmark":
+        if (point := known.landmarks.get(asked.identifier)) is None:
+            raise Unknown(f"there is no landmark '{asked.identifier}' among {len(known.landmarks)}")
+        return point
+    if (decision := known.decision(asked.identifier)) is None:
+        raise Unknown(f"nothing was decided about '{asked.identifier}' (ids are <source>/<sec>.<nsec>/<n>)")
+    return decision
+
+
+def covariance_at(known: Known, stamp: int, seven: Array) -> Array:
+    """(6, 6) in ROS order, of the pose `seven` at a stamp within the keyframes.
+
+    At a keyframe its marginal covariance. Between two, that of the nearer one (by distance moved, then angle, then time),
+    carried along the motion from there, and the noise that the odometry's model gives this motion added as if it
+    were independent. The keyframe beyond is left out, so this is an upper bound, and the nearer the tighter; it does not
+    use covariances that the messages stated, which a run does not keep.
+    """
+    space, keyframes = known.space, known.trajectory
+    pose = space.pose(seven.tolist())
+    right = int(np.searchsorted(keyframes.stamps, stamp))
+    beside = [right] if keyframes.stamps[right] == stamp else [right - 1, right]
+
+    def distance(row: int) -> tuple[float, float, int]:
+        near = space.pose(keyframes.sevens[row].tolist())
+        return *space.size(near.between(pose)), abs(stamp - int(keyframes.stamps[row]))
+
+    row = min(beside, key=distance)
+    tangent = known.covariance(int(known.indices[row]))
+    if len(beside) > 1:
+        start, near = int(keyframes.stamps[row]), space.pose(keyframes.sevens[row].tolist())
+        track = Track(space, known.noise.model_copy(update={"noise": "model"}))
+        track.add(start, near)
+        track.add(stamp, pose)
+        tangent = Motion(near, tangent).then(track.motion(start, stamp)).covariance
+    full, axes = np.zeros((6, 6)), GTSAM_AXES[space.dimension]
+    full[np.ix_(axes, axes)] = tangent
+    return covariance_to_ros(full, rotation_of(seven[3:]))

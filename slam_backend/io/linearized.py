@@ -1,0 +1,107 @@
+"""The kept factors, linearized at the final estimate: what the covariances of a finished run are computed from.
+
+graph.g2o cannot say all that they rest on: it has no line for gauges, absolute poses, robust weights and bearings. Here
+every factor is its whitened Jacobian, weight included, in a few flat arrays (linearized.npz):
+
+    indices   (N,) of the keyframes, in order of stamp, as in trajectory.tum
+    counts    (F,) variables of each factor      rows     (F,) rows of its Jacobian
+    keys      (M,) those variables, all factors  columns  (M,) their dimensions
+    numbers   the Jacobians one after the other, row by row
+"""
+
+import zlib
+from collections.abc import Iterable, Iterator
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+from zipfile import BadZipFile
+
+import gtsam
+import numpy as np
+
+from ..core.errors import BadFile, SolverFailure
+from ..core.graph import Factor, keyframe
+from ..core.measurement import Array
+from ..core.trajectory import Stamps
+
+ARRAYS = {"indices": "i", "counts": "i", "rows": "i", "keys": "u", "columns": "i", "numbers": "f"}
+ADDABLE = 3  # variables of a factor that gtsam can make from matrices directly
+
+
+def write_linearized(path: Path, factors: Iterable[Factor], values: gtsam.Values, indices: Stamps) -> None:
+    """factors: at `values`; inactive ones are left out."""
+    sizes = values.zeroVectors()
+    linear = [each for factor in factors if (each := factor.factor.linearize(values)) is not None]
+    keys = [list(each.keys()) for each in linear]
+    jacobians = [each.jacobian()[0] for each in linear]
+    flat = [key for each in keys for key in each]
+    np.savez_compressed(
+        path,
+        indices=indices,
+        counts=np.array([len(each) for each in keys], dtype=np.int64),
+        rows=np.array([len(each) for each in jacobians], dtype=np.int64),
+        keys=np.array(flat, dtype=np.uint64),
+        columns=np.array([len(sizes.at(key)) for key in flat], dtype=np.int64),
+        numbers=np.concatenate([np.zeros(0), *(each.ravel() for each in jacobians)]),
+    )
+
+
+class Linearized:
+    """The linearized factors of a file. BadFile if it is missing or damaged."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        try:
+            with np.load(path) as file:
+                arrays = {name: file[name] for name in ARRAYS}
+        except OSError as error:
+            raise BadFile(f"{path}: cannot be read: {error.strerror or error}") from None
+        except (TypeError, ValueError, KeyError, EOFError, BadZipFile, zlib.error) as error:
+            raise BadFile(f"{path}: is damaged: {str(error).splitlines()[0]}") from None
+        if any(arrays[name].ndim != 1 or arrays[name].dtype.kind != kind for name, kind in ARRAYS.items()):
+            raise BadFile(f"{path}: is damaged: its arrays are not those of a run")
+        self.indices: Stamps = arrays["indices"]
+        self._arrays = arrays
+
+    def covariance(self, index: int) -> Array:
+        """Marginal covariance of a keyframe's pose at its tangent. SolverFailure if the factors do not determine it."""
+        try:
+            found = np.asarray(self._tree.marginalCovariance(keyframe(index, 0).pose))
+        except (RuntimeError, IndexError, ValueError) as error:
+            raise SolverFailure(f"keyframe {index}: {' '.join(str(error).split())[:160]}", ()) from None
+        if not np.isfinite(found).all():
+            raise SolverFailure(f"keyframe {index}: the factors do not determine its pose", ())
+        return found
+
+    @cached_property
+    def _tree(self) -> Any:  # a GaussianBayesTree
+        """By QR, which long open trajectories do not break."""
+        graph: Any = gtsam.GaussianFactorGraph()
+        for terms, rows in self._factors():
+            if len(terms) <= ADDABLE:
+                graph.add(*(part for term in terms for part in term), np.zeros(rows))
+            else:  # a conditional is a factor too, and takes any number of variables
+                unit = gtsam.noiseModel.Unit.Create(rows)
+                graph.push_back(
+                    gtsam.JacobianFactor(gtsam.GaussianConditional(terms, 1, np.zeros(rows), unit))
+                )
+        return graph.eliminateMultifrontal(function=gtsam.EliminateQR)
+
+    def _factors(self) -> Iterator[tuple[list[tuple[int, Array]], int]]:
+        """(variable, its block) of each factor, and the number of rows."""
+        counts, rows, keys, columns, numbers = (self._arrays[name] for name in list(ARRAYS)[1:])
+        whole = len(counts) == len(rows) and counts.sum() == len(keys) == len(columns)
+        ends = np.cumsum(counts)
+        if whole and len(counts):
+            widths = np.add.reduceat(columns, ends - counts)
+            whole = bool((counts > 0).all()) and int((widths * rows).sum()) == len(numbers)
+        if not whole:
+            raise BadFile(f"{self._path}: is damaged: its arrays do not fit together")
+        at = 0
+        keys, columns = keys.tolist(), columns.tolist()
+        for end, count, height in zip(ends.tolist(), counts.tolist(), rows.tolist(), strict=True):
+            sizes = columns[end - count : end]
+            block = numbers[at : at + height * sum(sizes)].reshape(height, -1)
+            at += block.size
+            parts = np.split(block, np.cumsum(sizes[:-1]), axis=1)
+            yield list(zip(keys[end - count : end], parts, strict=True)), height
