@@ -1,0 +1,224 @@
+"""Where to start: the vertices that a file states, the odometry, or the chordal relaxation; `auto` chooses.
+
+A descent goes wrong where drift has wound the start around: an edge that disagrees with it by nearly half a turn is
+corrected the wrong way, and the descent stops in a wrong place or takes its time. So `auto` takes the file's vertices or
+the odometry where every edge agrees with them within `WOUND`. Else they have a few iterations to settle with no
+edge wound; if they do not, the chordal relaxation takes over.
+"""
+
+from collections import deque
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Literal, NamedTuple
+
+import gtsam
+import numpy as np
+
+from ..errors import BadConfig, SolverFailure
+from ..graph import Factor, Pose, is_pose
+from ..measurement import Array
+from ..space import Space
+from .chordal import chordal
+from .descent import NO_FALL, Descent, Options, Progress, Step, unwatched
+from .edges import Edges, edges_of, matrices_of, pose_of_matrix, turns
+from .gauges import FIXING, Layout, gauges, layout, space_of
+
+InitializationName = Literal["auto", "file", "odometry", "chordal"]
+WOUND, UNWOUND = 2.0, 1.0  # rad: of a start, of the end that it led to
+TRIAL = 8  # iterations
+
+
+class Start(NamedTuple):
+    """A start that has every variable. cost: of the initialization; steps: what `auto` went on from there already."""
+
+    values: gtsam.Values
+    name: str
+    cost: float
+    steps: tuple[Step, ...] = ()
+    why: str = ""
+
+
+@dataclass(frozen=True, eq=False)
+class Ground:
+    """What an initialization may use. stated: the values of the file, all or some of them."""
+
+    factors: Sequence[Factor]
+    stated: gtsam.Values
+    space: Space
+    found: Layout
+
+    @cached_property
+    def edges(self) -> Edges:
+        return edges_of(self.factors, self.found, self.space)
+
+    @cached_property
+    def keys(self) -> list[int]:
+        return [int(key) for key in self.found.keys]
+
+
+def initialize(
+    factors: Sequence[Factor],
+    stated: gtsam.Values | None = None,
+    how: InitializationName = "auto",
+    options: Options | None = None,
+    progress: Progress = unwatched,
+) -> Start:
+    """A start for `solve`. BadConfig if `file` is asked for and the file states no vertices."""
+    space = space_of(factors)
+    stated = gtsam.Values() if stated is None else stated
+    ground = Ground(factors, stated, space, layout(factors, stated))
+    if how == "auto":
+        return _chosen(ground, options or Options(), progress)
+    return _from(how, ground)
+
+
+def cost_of(factors: Sequence[Factor], values: gtsam.Values) -> float:
+    """chi2/2, gauges left out."""
+    graph = gtsam.NonlinearFactorGraph()
+    for factor in factors:
+        if factor.kind != "gauge":
+            graph.add(factor.factor)
+    return float(graph.error(values))
+
+
+def _chosen(ground: Ground, options: Options, progress: Progress) -> Start:
+    tried = []
+    for name in ("file", "odometry") if _states_all(ground) else ("odometry",):
+        start = _from(name, ground)
+        if (wound := _wound(ground, start.values)) < WOUND:
+            return start._replace(why=f"no edge disagrees with it by more than {wound:.2g} rad")
+        tried.append(start)
+    nearest = min(tried, key=lambda start: start.cost)
+    ahead, cost, settled = _advanced(nearest, ground, options, progress)
+    if settled and _wound(ground, ahead.values) < UNWOUND:
+        return ahead._replace(why=f"settled within {TRIAL} iterations")
+    start = _from("chordal", ground)
+    if start.cost < cost:
+        return start._replace(
+            why=f"cost {start.cost:.6g}, against {cost:.6g} from {nearest.name} after {TRIAL} iterations"
+        )
+    other, other_cost, _ = _advanced(start, ground, options, progress)
+    best, worse = (other, cost) if other_cost < cost else (ahead, other_cost)
+    return best._replace(
+        why=f"costs after {TRIAL} iterations: {min(cost, other_cost):.6g}, the other {worse:.6g}"
+    )
+
+
+def _from(name: str, ground: Ground) -> Start:
+    values = _complete(INITIALIZATIONS[name](ground), ground)
+    return Start(values, name, cost_of(ground.factors, values))
+
+
+def _advanced(
+    start: Start, ground: Ground, options: Options, progress: Progress
+) -> tuple[Start, float, bool]:
+    """The start a few iterations on, its cost there, and whether it has settled already."""
+    held = gauges(ground.factors, ground.found, start.values, ground.space)
+    touched = ground.found.touched(start.values)
+    trial = replace(options, method="lm", iterations=TRIAL)
+    descent = Descent([*ground.factors, *held], touched, trial, progress)
+    stop = descent.run()
+    values = gtsam.Values(start.values)
+    values.update(descent.values)
+    return start._replace(values=values, steps=tuple(descent.steps)), descent.cost, stop == NO_FALL
+
+
+def _wound(ground: Ground, values: gtsam.Values) -> float:
+    """The angle (rad) by which the worst edge disagrees with the values."""
+    poses = [
+        ground.space.pose_in(values, key) if is_pose(key) else ground.space.identity for key in ground.keys
+    ]
+    rotations = matrices_of(ground.space, poses)[:, :-1, :-1]
+    return float(turns(ground.edges, rotations).max(initial=0.0))
+
+
+def _states_all(ground: Ground) -> bool:
+    return all(ground.stated.exists(key) for key in ground.keys if is_pose(key))
+
+
+def _stated(ground: Ground) -> gtsam.Values:
+    if not _states_all(ground):
+        raise BadConfig(
+            "initialization 'file': the graph states no vertices, or not all of them; use odometry"
+        )
+    return ground.stated
+
+
+def _odometry(ground: Ground) -> gtsam.Values:
+    """Along odometry edges as far as they lead, then over as few others as possible: a search in which odometry is free."""
+    edges = ground.edges
+    poses: dict[int, Pose] = dict.fromkeys(np.unique(ground.found.part).tolist(), ground.space.identity)
+    beside: list[list[tuple[int, int]]] = [[] for _ in ground.found.keys]  # (edge, other end)
+    for edge, (i, j) in enumerate(zip(edges.i.tolist(), edges.j.tolist(), strict=True)):
+        beside[i].append((edge, j))
+        beside[j].append((edge, i))
+    ahead = deque((root, root, -1) for root in poses)  # (row, the row before it, the edge between)
+    done = [False] * len(beside)
+    while ahead:
+        row, before, edge = ahead.popleft()
+        if done[row]:
+            continue
+        done[row] = True
+        if edge >= 0:
+            step = edges.poses[edge]
+            poses[row] = poses[before].compose(step if edges.j[edge] == row else step.inverse())
+        for edge, other in beside[row]:
+            if not done[other]:
+                (ahead.appendleft if edges.motion[edge] else ahead.append)((other, row, edge))
+    return _anchored(poses, ground)
+
+
+def _chordal(ground: Ground) -> gtsam.Values:
+    rotations, translations = chordal(ground.edges, np.unique(ground.found.part), len(ground.found.keys))
+    poses = {
+        row: pose_of_matrix(ground.space, rotation, translation)
+        for row, (rotation, translation) in enumerate(zip(rotations, translations, strict=True))
+    }
+    return _anchored(poses, ground)
+
+
+INITIALIZATIONS: Mapping[str, Callable[[Ground], gtsam.Values]] = {
+    "file": _stated,
+    "odometry": _odometry,
+    "chordal": _chordal,
+}
+
+
+def _anchored(poses: Mapping[int, Pose], ground: Ground) -> gtsam.Values:
+    """Each part moved to what holds it in space, else to where the file states its first pose."""
+    shift: dict[int, Pose] = {}
+    fixing = [factor for factor in ground.factors if factor.kind in FIXING]
+    for row, factor in zip(ground.found.rows([f.keys[0] for f in fixing]).tolist(), fixing, strict=True):
+        if (part := int(ground.found.part[row])) not in shift:
+            shift[part] = factor.factor.prior().compose(poses[row].inverse())
+    for part, root in zip(np.unique(ground.found.part).tolist(), ground.found.roots, strict=True):
+        if part not in shift and ground.stated.exists(root):
+            shift[part] = ground.space.pose_in(ground.stated, root).compose(poses[part].inverse())
+    values = gtsam.Values()
+    for row, (key, part) in enumerate(zip(ground.keys, ground.found.part.tolist(), strict=True)):
+        if is_pose(key):
+            values.insert(key, shift[part].compose(poses[row]) if part in shift else poses[row])
+    return values
+
+
+def _complete(poses: gtsam.Values, ground: Ground) -> gtsam.Values:
+    """With what the file states of vertices that nothing touches, and landmarks where the file or else a sighting says."""
+    values = gtsam.Values(ground.stated)
+    values.insert_or_assign(poses)
+    for factor in ground.factors:
+        if factor.kind == "landmark" and not values.exists(factor.keys[1]):
+            pose = ground.space.pose_in(values, factor.keys[0])
+            values.insert(factor.keys[1], pose.transformFrom(_seen(factor)))
+    for key in ground.keys:
+        if not values.exists(key):
+            raise SolverFailure(f"nothing says where {gtsam.DefaultKeyFormatter(key)} might be", ())
+    return values
+
+
+def _seen(factor: Factor) -> Array:
+    """A landmark in the frame of the pose that saw it, from its bearing and range."""
+    measured = factor.factor.measured()
+    bearing = measured.bearing()
+    direction = bearing.point3() if hasattr(bearing, "point3") else np.array([bearing.c(), bearing.s()])
+    return np.asarray(direction * measured.range())
