@@ -65,11 +65,11 @@ class Feeder:
         request = Request(next(self._ids), name, argument)
         self._send(request)
         with self._answered:
-            if not self._answered.wait_for(lambda: request.id in self._answers, timeout):
+            if not self._answered.wait_for(lambda: request.id in self._answers or not self.alive, timeout):
                 raise SlamError(
                     f"the worker did not answer '{name}' within {timeout:g} s: it is busy or lost"
                 )
-            answer = self._answers.pop(request.id)
+            answer = self._answers.pop(request.id, Answer(request.id, error="the worker ended before it answered"))
         if answer.error:
             raise SlamError(answer.error)
         return answer.content
@@ -138,6 +138,8 @@ class Feeder:
                 with self._answered:
                     self._answers[message.id] = message
                     self._answered.notify_all()
+        with self._answered:
+            self._answered.notify_all()
         if not self._stop.is_set():
             self._process.join()
             code = self._process.exitcode

@@ -16,7 +16,7 @@ from typing import Any, Literal
 from ..core.backend import Update
 from ..core.config import Config
 from ..core.errors import SlamError
-from ..core.graph import Decision
+from ..core.graph import Decision, keyframe
 from ..core.measurement import Measurement
 from .cdr import Decoder
 from .journal import Row
@@ -24,7 +24,7 @@ from .replay import Result, Run
 from .rundir import write_run
 from .typestore import typestore_of
 
-RequestName = Literal["snapshot", "save", "finish"]
+RequestName = Literal["snapshot", "covariance", "save", "finish"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,7 +44,9 @@ class Report:
 
 @dataclass(frozen=True, slots=True)
 class Request:
-    """snapshot: a Snapshot. save: write a run directory at `argument`. finish: the input has ended; save, and end."""
+    """snapshot: a Snapshot. covariance: of the pose of keyframe number `argument`, at its tangent. save: write a run
+    directory at `argument`. finish: the input has ended; save, and end.
+    """
 
     id: int
     name: RequestName
@@ -128,12 +130,17 @@ class _Worker:
         self._told = 0
 
     def serve(self) -> None:
-        for update in self._run:
-            self._updates.append(update)
-        self._report()
+        failed = ""
+        try:
+            for update in self._run:
+                self._updates.append(update)
+        except SlamError as error:  # there was nothing to make a trajectory of
+            failed = str(error)
         last = self._inputs.last
-        if last is not None:
-            self._pipe.send(self._inputs.answered(last))
+        if last is None:
+            return  # the node is gone: nobody to tell
+        self._report()
+        self._pipe.send(Answer(last.id, error=failed) if failed else self._inputs.answered(last))
 
     def _report(self) -> None:
         """Send what is new, if anything is."""
@@ -163,6 +170,8 @@ class _Worker:
     def _answer(self, request: Request) -> Any:
         if request.name == "snapshot":
             return self._run.backend.snapshot()
+        if request.name == "covariance":
+            return self._run.backend.estimate.covariance([keyframe(int(request.argument), 0).pose])
         result = Result(self._run)
         write_run(result, Path(request.argument))
         return result.summary

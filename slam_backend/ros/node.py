@@ -8,6 +8,8 @@ so that it never waits for the solver. No callback blocks.
 import signal
 import sys
 import threading
+from collections.abc import Callable
+from functools import wraps
 from pathlib import Path
 from time import monotonic
 from typing import Any
@@ -40,7 +42,26 @@ from .state import State
 
 LOOK = 0.3  # s between two looks at the graph
 JUMP = SECOND  # ns that the driving source must go back for its clock to have jumped
+WATCHED = ("path", "trajectory", "landmarks", "graph")  # outputs that are made from a snapshot
 FAREWELL = 30.0  # s that the worker may take to flush and save at the end
+
+
+def _explained(
+    transition: Callable[..., TransitionCallbackReturn],
+) -> Callable[..., TransitionCallbackReturn]:
+    """Rclpy swallows what a transition raises; say it, and fail."""
+
+    @wraps(transition)
+    def wrapped(node: "BackendNode", state: LifecycleState) -> TransitionCallbackReturn:
+        try:
+            return transition(node, state)
+        except SlamError as error:
+            node.get_logger().error(str(error))
+        except Exception as error:  # noqa: BLE001  # whatever it is, it must be said
+            node.get_logger().error(f"{transition.__name__}: {type(error).__name__}: {error}")
+        return TransitionCallbackReturn.FAILURE
+
+    return wrapped
 
 
 class BackendNode(LifecycleNode):
@@ -58,9 +79,9 @@ class BackendNode(LifecycleNode):
         self._feeder: Feeder | None = None
         self._inputs: Inputs | None = None
         self._outputs: Outputs | None = None
-        self._services: Services | None = None
+        self._answering: Services | None = None
         self._decoder: Decoder | None = None
-        self._timers: list[Any] = []
+        self._beats: list[Any] = []
         self._kinds: dict[str, str | None] = {}  # topics whose first message has been looked at
         self._odometer = Odometer(self.config)
         self._closing = False
@@ -73,12 +94,10 @@ class BackendNode(LifecycleNode):
 
     # -- lifecycle -------------------------------------------------------------------------------
 
+    @_explained
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:  # noqa: ARG002
-        try:
-            self._open()
-        except SlamError as error:
-            self.get_logger().error(str(error))
-            return TransitionCallbackReturn.FAILURE
+        self._open()
+        self._closing = False
         self._outputs = Outputs(
             self,
             self.config,
@@ -86,33 +105,40 @@ class BackendNode(LifecycleNode):
             self.config.odom_frame,
             self.config.base_frame or "base_link",
         )
-        self._services = Services(
+        self._answering = Services(
             self, self.state, lambda: self._feeder, self._refresh.set, self.data_dir, self.config, self.reset
         )
         self._diagnostics = Diagnostics(self, self.state)
         threading.Thread(target=self._snapshots, name="snapshots", daemon=True).start()
         return TransitionCallbackReturn.SUCCESS
 
+    @_explained
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:  # noqa: ARG002
         self._inputs = Inputs(self, self._received)
         steady = Clock(clock_type=ClockType.STEADY_TIME)  # timers run whether or not /clock does
-        self._timers = [
+        self._beats = [
             self.create_timer(LOOK, self._look, clock=steady),
-            self.create_timer(1.0 / self.config.path.rate, self._refresh.set, clock=steady),
+            self.create_timer(1.0 / self.config.path.rate, self._refresh_if_watched, clock=steady),
             self.create_timer(1.0, self._diagnose, clock=steady),
         ]
+        if self._outputs is not None:
+            self._outputs.set_active(True)
         self._look()
         return TransitionCallbackReturn.SUCCESS
 
+    @_explained
     def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:  # noqa: ARG002
         self._silence()
+        if self._outputs is not None:
+            self._outputs.set_active(False)
         return TransitionCallbackReturn.SUCCESS
 
+    @_explained
     def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:  # noqa: ARG002
         self.close()
-        self._closing = False
         return TransitionCallbackReturn.SUCCESS
 
+    @_explained
     def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:  # noqa: ARG002
         self.close()
         return TransitionCallbackReturn.SUCCESS
@@ -133,10 +159,10 @@ class BackendNode(LifecycleNode):
         self._closing = True
         self._silence()
         self._end_session("run")
-        for part in (self._services, self._outputs):
+        for part in (self._answering, self._outputs):
             if part is not None:
                 part.close()
-        self._services = self._outputs = None
+        self._answering = self._outputs = None
 
     def reset(self) -> None:
         """A new session: the run so far is saved, its journal set aside, the map starts empty. Takes a while; any thread."""
@@ -186,9 +212,9 @@ class BackendNode(LifecycleNode):
             )
 
     def _silence(self) -> None:
-        for timer in self._timers:
+        for timer in self._beats:
             self.destroy_timer(timer)
-        self._timers = []
+        self._beats = []
         if self._inputs is not None:
             self._inputs.close()
             self._inputs = None
@@ -300,6 +326,10 @@ class BackendNode(LifecycleNode):
             shown = update.keyframe.index
             threading.Event().wait(4 * (monotonic() - begin))  # at most a fifth of the worker's time
 
+    def _refresh_if_watched(self) -> None:
+        if self._outputs is not None and any(map(self._outputs.has_listeners, WATCHED)):
+            self._refresh.set()
+
     def _diagnose(self) -> None:
         if self._inputs is not None:
             self._diagnostics.publish(self._inputs.flows, self._feeder, self._journal, self.config)
@@ -308,6 +338,8 @@ class BackendNode(LifecycleNode):
         config, result = changed(self.config, parameters)
         if result.successful:
             self.config = config
+            if self._outputs is not None:
+                self._outputs.config = config
         return result
 
 
@@ -344,7 +376,7 @@ def main(arguments: list[str] | None = None, config: Config | None = None) -> in
     try:
         if node.config.autostart:
             if node.trigger_configure() != TransitionCallbackReturn.SUCCESS:
-                return 2
+                return 2  # the reason has been logged
             node.trigger_activate()
         executor.spin()
     except (KeyboardInterrupt, ExternalShutdownException):
