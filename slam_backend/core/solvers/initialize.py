@@ -82,9 +82,14 @@ def cost_of(factors: Sequence[Factor], values: gtsam.Values) -> float:
     return float(graph.error(values))
 
 
+def states_all(factors: Sequence[Factor], stated: gtsam.Values) -> bool:
+    """Whether there is a value for every pose that the factors touch."""
+    return all(stated.exists(key) for factor in factors for key in factor.keys if is_pose(key))
+
+
 def _chosen(ground: Ground, options: Options, progress: Progress) -> Start:
     tried = []
-    for name in ("file", "odometry") if _states_all(ground) else ("odometry",):
+    for name in ("file", "odometry") if states_all(ground.factors, ground.stated) else ("odometry",):
         start = _from(name, ground)
         if (wound := _wound(ground, start.values)) < WOUND:
             return start._replace(why=f"no edge disagrees with it by more than {wound:.2g} rad")
@@ -133,12 +138,8 @@ def _wound(ground: Ground, values: gtsam.Values) -> float:
     return float(turns(ground.edges, rotations).max(initial=0.0))
 
 
-def _states_all(ground: Ground) -> bool:
-    return all(ground.stated.exists(key) for key in ground.keys if is_pose(key))
-
-
 def _stated(ground: Ground) -> gtsam.Values:
-    if not _states_all(ground):
+    if not states_all(ground.factors, ground.stated):
         raise BadConfig(
             "initialization 'file': the graph states no vertices, or not all of them; use odometry"
         )

@@ -1,0 +1,103 @@
+"""From a pose graph file to its optimum: initialization, descent, robustness, in the order that `solve` takes them.
+
+The clock is read here, after every iteration; the core has none.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from time import perf_counter
+from typing import Literal
+
+from ..core.config import KernelName
+from ..core.graph import Factor
+from ..core.solvers.batch import Solution, polish, solve
+from ..core.solvers.descent import MethodName, Options, Step
+from ..core.solvers.gnc import solve_gnc
+from ..core.solvers.initialize import InitializationName, Start, cost_of, initialize, states_all
+from .online import solve_online
+from .problem import Problem
+
+Advance = Callable[[int], None]
+
+
+@dataclass(frozen=True, slots=True)
+class Request:
+    """What `solve` is asked for; the kernel is in the problem already."""
+
+    method: MethodName | Literal["isam2"] = "lm"
+    gnc: bool = False
+    kernel: KernelName = "none"  # for isam2, which makes its own factors
+    init: InitializationName = "auto"
+    ordering: Literal["colamd", "metis"] = "colamd"
+    polish: bool = False
+
+    @property
+    def options(self) -> Options:
+        method: MethodName = "lm" if self.method == "isam2" else self.method
+        return Options(method, self.ordering, polish=self.polish)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Optimum:
+    """start: with its cost and why it was chosen. steps: each with the seconds it took; seconds: of all of them and of
+    the initialization. refused: the loops that GNC took out; the costs of the solution are those of what it kept.
+    cost_initial: of the file's vertices, or of the odometry where it states none.
+    """
+
+    start: Start
+    cost_initial: float
+    solution: Solution
+    steps: tuple[tuple[Step, float], ...]
+    seconds: float
+    refused: tuple[Factor, ...] = ()
+
+
+def optimum(problem: Problem, request: Request, advance: Advance) -> Optimum:
+    """Solve. advance: called with 1 after every iteration; with isam2, of every vertex."""
+    watch = Watch(advance)
+    factors, options = problem.factors, request.options
+    refused: tuple[str, ...] = ()
+    if request.method == "isam2":
+        online, relinearized = solve_online(problem, request.kernel, advance)
+        start = Start(online, "isam2", cost_of(factors, online), why="iSAM2's last estimate")
+        nothing = replace(options, iterations=0, polish=False)
+        solution = replace(solve(factors, relinearized, nothing), stop="every vertex is in")
+        if request.polish:
+            solution = polish(factors, relinearized, options, watch)
+    else:
+        # wrong loops would lead any start astray that rests on them
+        init = "odometry" if request.gnc and request.init == "auto" else request.init
+        start = initialize(factors, problem.stated, init, options, watch)
+        if request.gnc:
+            solution, refused = solve_gnc(factors, start.values, options, watch)
+        else:
+            solution = solve(factors, start.values, options, watch)
+    seconds, gone = watch.elapsed, set(refused)
+    removed = tuple(factor for factor in factors if factor.id in gone)
+    return Optimum(start, initial_cost(problem, start), solution, tuple(watch.steps), seconds, removed)
+
+
+def initial_cost(problem: Problem, start: Start) -> float:
+    """Of the file's vertices, or of the odometry where the file states none: before anything was done."""
+    stated = states_all(problem.factors, problem.stated)
+    before: InitializationName = "file" if stated else "odometry"
+    return start.cost if start.name == before else initialize(problem.factors, problem.stated, before).cost
+
+
+class Watch:
+    """Takes the time of each iteration."""
+
+    def __init__(self, advance: Advance) -> None:
+        self.steps: list[tuple[Step, float]] = []
+        self._advance = advance
+        self._begin = self._last = perf_counter()
+
+    def __call__(self, step: Step) -> None:
+        now = perf_counter()
+        self.steps.append((step, now - self._last))
+        self._last = now
+        self._advance(1)
+
+    @property
+    def elapsed(self) -> float:
+        return perf_counter() - self._begin
