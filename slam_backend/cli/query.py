@@ -60,4 +60,4 @@ def _line(answer: "Answer") -> str:
         return f"{answer.name}: {value['verdict']} by {value['stage']}/{value['reason']}{compared}: {value['detail']}"
     if isinstance(value[0], list):
         return "\n".join([f"{answer.name}:", *(" ".join(f"{x:13.6e}" for x in row) for row in value)])
-    return f"{answer.name}: {' '.join(f'{x:.6f}' for x in value)}"
+    return f"{answer.name}: {' '.join(f'{x:z.6f}' for x in value)}"

@@ -120,10 +120,13 @@ class FinishedRun:
         try:
             self.summary: dict[str, Any] = json.loads(read_text(path / "summary.json"))
             self._keyframes = int(self.summary["counts"]["keyframes"])
+            self._landmarks = int(self.summary["counts"]["landmarks"])
         except json.JSONDecodeError as error:
             raise BadFile(f"{path / 'summary.json'}:{error.lineno}: is damaged: {error.msg}") from None
         except (KeyError, TypeError, ValueError):
-            raise BadFile(f"{path / 'summary.json'}: is damaged: it does not count the keyframes") from None
+            raise BadFile(
+                f"{path / 'summary.json'}: is damaged: it does not count keyframes and landmarks"
+            ) from None
 
     @cached_property
     def config(self) -> Config:
@@ -145,20 +148,22 @@ class FinishedRun:
     @cached_property
     def trajectory(self) -> Trajectory:
         found = self._trajectory("trajectory.tum")
-        if len(found) != self._keyframes:
-            counted = f"holds {len(found)} keyframes where summary.json counts {self._keyframes}"
-            raise BadFile(f"{self.path / 'trajectory.tum'}: {counted}")
+        self._counted("trajectory.tum", len(found), self._keyframes)
         return found
 
     @cached_property
     def odometry(self) -> Trajectory:
-        return self._trajectory("odometry.tum")
+        found, known = self._trajectory("odometry.tum"), self.trajectory.stamps
+        if found.stamps[0] > known[0] or found.stamps[-1] < known[-1]:
+            raise BadFile(
+                f"{self.path / 'odometry.tum'}: is damaged: it does not reach from the first keyframe to the last"
+            )
+        return found
 
     @cached_property
     def linearized(self) -> Linearized:
         found = Linearized(self.path / "linearized.npz")
-        if len(found.indices) != self._keyframes:
-            raise BadFile(f"{self.path / 'linearized.npz'}: is of another run than summary.json")
+        self._counted("linearized.npz", len(found.indices), self._keyframes)
         return found
 
     @property
@@ -172,9 +177,11 @@ class FinishedRun:
         reader = csv.reader(StringIO(read_text(path), newline=""))
         try:
             next(reader)
-            return {row[0]: np.array(row[2:5], dtype=np.float64).reshape(3) for row in reader}
+            found = {row[0]: np.array(row[2:5], dtype=np.float64).reshape(3) for row in reader}
         except (csv.Error, ValueError, IndexError):
             raise BadFile(f"{path}:{reader.line_num}: is damaged: no name and position") from None
+        self._counted(path.name, len(found), self._landmarks)
+        return found
 
     def covariance(self, index: int) -> Array:
         return self.linearized.covariance(index)
@@ -183,6 +190,8 @@ class FinishedRun:
         """The last line of decisions.jsonl about it."""
         path, needle = self.path / "decisions.jsonl", json.dumps(identifier).encode()
         lines = read_bytes(path).split(b"\n")
+        if lines[-1]:
+            raise BadFile(f"{path}:{len(lines)}: is damaged: the line does not end")
         for number in range(len(lines), 0, -1):
             if needle in lines[number - 1]:
                 try:
@@ -192,6 +201,12 @@ class FinishedRun:
                 if line.get("id") == identifier:
                     return line
         return None
+
+    def _counted(self, name: str, found: int, counted: int) -> None:
+        if found != counted:
+            raise BadFile(
+                f"{self.path / name}: is damaged: it holds {found} where summary.json counts {counted}"
+            )
 
     def _trajectory(self, name: str) -> Trajectory:
         found = tum.read(self.path / name)
