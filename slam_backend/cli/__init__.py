@@ -23,6 +23,7 @@ VERBS: Mapping[
 ] = {  # verb: its line in `--help`; slam_backend/cli/VERB.py holds its function `command`
     "replay": "Bags and pose graphs through the smoother, into a run directory.",
     "run": "The ROS 2 node.",
+    "play": "A bag's messages to real topics.",
     "solve": "The optimum of a pose graph.",
     "dataset": "A public data set that ships with gtsam, as a bag.",
     "simulate": "A world with ground truth, as a bag.",
