@@ -195,11 +195,11 @@ class FinishedRun:
         for number in range(len(lines), 0, -1):
             if needle in lines[number - 1]:
                 try:
-                    line: dict[str, Any] = json.loads(lines[number - 1])
+                    line: Any = json.loads(lines[number - 1])
                 except ValueError:
                     raise BadFile(f"{path}:{number}: is damaged: no JSON") from None
-                if line.get("id") == identifier:
-                    return line
+                if isinstance(line, dict) and line.get("id") == identifier:
+                    return dict(line)
         return None
 
     def _counted(self, name: str, found: int, counted: int) -> None:
