@@ -6,6 +6,7 @@ Only what the configuration uses is judged: the axes of the space, and covarianc
 
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
+from functools import lru_cache
 from math import dist, isfinite
 from typing import Any
 
@@ -186,13 +187,7 @@ def _landmark(item: LandmarkObservation, space: Space, source: Any) -> bool:  # 
         raise Fault("range", "the range is not positive", float(item.value[-1]), 0.0)
     if item.form == "position" and not np.any(item.value[: space.point_dimension]):
         raise Fault("range", "the landmark is where the sensor is", 0.0, 0.0)
-    block = item.covariance[np.ix_(keep, keep)]
-    diagonal = np.diag(block)
-    if np.isnan(diagonal).all() or not diagonal.any():
-        return False  # no noise stated: the configured default
-    unknown = np.isnan(diagonal)
-    _judge(np.where(np.isnan(block) & (unknown[:, None] | unknown), 0.0, block))
-    return bool((diagonal == 0).any())
+    return _said(_verdict_of_sighting(item.covariance.tobytes(), size, tuple(keep)))
 
 
 def _stamp(item: Measurement) -> None:
@@ -214,11 +209,38 @@ def _pose(seven: Array, space: Space) -> None:
 
 def _covariance(ros: Array, space: Space) -> bool:
     """Judge the used block; True when a variance of zero asks for the default."""
-    if not ros.any():
-        return True
-    block = ros.reshape(6, 6)[np.ix_(space.used, space.used)]
-    _judge(block)
+    return _said(_verdict(ros.tobytes(), space.used))
+
+
+@lru_cache(maxsize=4096)  # robots repeat their covariances
+def _verdict(raw: bytes, used: tuple[int, ...]) -> "bool | Fault":
+    block = np.frombuffer(raw).reshape(6, 6)[np.ix_(used, used)]
+    try:
+        _judge(block)
+    except Fault as fault:
+        return fault
     return bool((np.diag(block) == 0).any())
+
+
+@lru_cache(maxsize=4096)
+def _verdict_of_sighting(raw: bytes, size: int, used: tuple[int, ...]) -> "bool | Fault":
+    """The same, where NaN on the diagonal, too, asks for the default; False where no noise is stated at all."""
+    block = np.frombuffer(raw).reshape(size, size)[np.ix_(used, used)]
+    diagonal = np.diag(block)
+    if np.isnan(diagonal).all() or not diagonal.any():
+        return False
+    unknown = np.isnan(diagonal)
+    try:
+        _judge(np.where(np.isnan(block) & (unknown[:, None] | unknown), 0.0, block))
+    except Fault as fault:
+        return fault
+    return bool((diagonal == 0).any())
+
+
+def _said(verdict: "bool | Fault") -> bool:
+    if isinstance(verdict, Fault):
+        raise verdict.with_traceback(None)  # else it would grow with each raise
+    return verdict
 
 
 def _judge(block: Array) -> None:

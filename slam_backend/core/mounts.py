@@ -4,15 +4,20 @@ from collections.abc import Mapping, Sequence
 
 from .graph import Pose
 from .measurement import StaticTransform
-from .space import Space
+from .space import Space, Spatial
+
+SPATIAL = Spatial()
 
 
 class Mounts:
-    """Frames by name. The configuration wins over /tf_static, for what hangs below its frames too; '', 'base' and the base frame are the base itself."""
+    """Frames by name. The configuration wins over /tf_static, for what hangs below its frames too; '', 'base' and
+    the base frame are the base itself. Chains are composed in 3-D whatever the space: the frames between a planar
+    base and its sensor may be tilted.
+    """
 
     def __init__(self, space: Space, base: str, extrinsics: Mapping[str, Sequence[float]]) -> None:
         self._space, self._base = space, base.lstrip("/")
-        self._given = {frame.lstrip("/"): space.from_extrinsics(six) for frame, six in extrinsics.items()}
+        self._given = {frame.lstrip("/"): SPATIAL.from_extrinsics(six) for frame, six in extrinsics.items()}
         self._parents: dict[str, tuple[str, Pose]] = {}
         self._found: dict[str, Pose] = {}
 
@@ -25,20 +30,18 @@ class Mounts:
     def add(self, transform: StaticTransform) -> None:
         parent, child = transform.parent.lstrip("/"), transform.child.lstrip("/")
         if child != parent:
-            self._parents[child] = (parent, self._space.pose(transform.pose.tolist()))
+            self._parents[child] = (parent, SPATIAL.pose(transform.pose.tolist()))
             self._found.clear()
 
     def get(self, frame: str) -> Pose | None:
         """`base_T_frame`; the space's own `identity` object for the base; None when unknown."""
         if frame in ("", "base", self._base):
             return self._space.identity
-        if frame in self._given:
-            return self._given[frame]
         if frame not in self._found:
-            found = self._search(frame)
+            found = self._given.get(frame) or self._search(frame)
             if found is None:
                 return None
-            self._found[frame] = found
+            self._found[frame] = self._space.pose(SPATIAL.seven(found))
         return self._found[frame]
 
     def _search(self, frame: str) -> Pose | None:
@@ -54,8 +57,8 @@ class Mounts:
 
     def _ancestors(self, frame: str) -> dict[str, Pose]:
         """Ancestor -> `ancestor_T_frame`, nearest first, the frame itself included."""
-        found = {frame: self._space.identity}
-        pose = self._space.identity
+        found = {frame: SPATIAL.identity}
+        pose = SPATIAL.identity
         while frame in self._parents:
             frame, step = self._parents[frame]
             if frame in found:
