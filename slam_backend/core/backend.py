@@ -3,7 +3,6 @@
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from heapq import heappop, heappush
 from typing import Any
 
 import gtsam
@@ -11,37 +10,32 @@ import numpy as np
 
 from .apply import Applier, touched, without
 from .config import Config, LandmarkSource, OdometrySource, PoseSource, RelativeSource
-from .context import Context, Unusable
+from .context import Context
 from .errors import BadConfig, SlamError, SolverFailure
 from .graph import (
     Decision,
     Delta,
     Estimate,
-    Factor,
     Keyframe,
     Offer,
     Pose,
-    Wait,
-    identify,
-    keyframe,
     landmark_key,
     total,
 )
+from .growth import Growth
 from .keyframes import Timeline, Track, due
-from .measurement import Array, Measurement, StaticTransform, format_stamp
+from .measurement import Array, Measurement, StaticTransform
 from .mounts import Mounts
 from .parts import Parts
 from .robust import Robust
-from .robust.kernels import noise_of
-from .sensors import SENSORS, relative
+from .sensors import SENSORS
 from .sensors.odometry import OdometryPose
-from .sensors.relative import RelativePose
 from .settle import FAR
 from .solvers import SOLVERS, Solver
 from .space import SPACES
 from .trajectory import Snapshot, Trajectory
+from .waiting import Waiting
 
-GAUGE_SIGMA = 1e-3  # m and rad; of the prior that fixes a part of the graph in space
 SOURCES = {  # of a configuration that names none: one of each kind, by the name of its kind
     "odometry": OdometrySource(),
     "relative": RelativeSource(),
@@ -92,13 +86,11 @@ class Backend:
         self.parts = Parts()
         self._mounts = Mounts(space, config.base_frame, config.extrinsics)
         self._landmarks: dict[str, int] = {}
-        self._pending: list[Offer] = []
-        self._asked: list[int] = []  # stamps at which a source wants a keyframe
-        self._waiting: dict[int, list[Wait]] = defaultdict(list)
-        self._counts: dict[str, dict[int, int]] = defaultdict(dict)
+        self._waiting = Waiting(config)
+        self._growth = Growth(space, self.timeline, self.track, self.parts)
         self._decisions: list[Decision] = []  # told with the next update
         self._newest: tuple[Keyframe, Pose] | None = None  # and its odometry pose
-        self._applier = Applier(self.solver, space, self.parts, self._wake)
+        self._applier = Applier(self.solver, space, self.parts, self._waiting.wake)
         self._revision = 0
 
     def add(self, measurement: Measurement) -> list[Update]:
@@ -109,9 +101,9 @@ class Backend:
         if isinstance(measurement, OdometryPose) and measurement.source == self._driver:
             return self._drive(measurement)
         updates = []
-        if self._relative and self._pending and measurement.stamp > self._pending[-1].measurement.stamp:
+        if self._relative and self._waiting and measurement.stamp > self._waiting.newest:
             updates = self._close()
-        self._offer(measurement)
+        self._waiting.offer(measurement)
         return updates
 
     def finish(self) -> list[Update]:
@@ -120,9 +112,9 @@ class Backend:
         if not self._relative and self._newest and self.track.newest > self._newest[0].stamp:
             updates += self._extend(self.track.newest)
         updates += self._close(last=True)
-        while self._newest and self._pending:  # what was waiting for that, or was put back
+        while self._newest and self._waiting:  # what was waiting for that, or was put back
             updates += self._close(last=True)
-        self._refuse_leftovers()
+        self._decisions += self._waiting.leftovers()
         if self._newest and self._decisions:
             updates.append(self._told(self._newest[0]))
         return updates
@@ -172,26 +164,13 @@ class Backend:
 
     # -- the way of a measurement ----------------------------------------------------------------
 
-    def _offer(self, measurement: Measurement) -> None:
-        source = self.config.sources.get(measurement.source)
-        if source is None:
-            known = ", ".join(self.config.sources)
-            raise BadConfig(f"there is no source '{measurement.source}'; known: {known}")
-        counts = self._counts[measurement.source]
-        n = counts[measurement.stamp] = counts.get(measurement.stamp, -1) + 1
-        self._pending.append(Offer(identify(measurement, n), measurement))
-        if getattr(source, "keyframe", False):
-            for stamp in measurement.ends or (measurement.stamp,):
-                heappush(self._asked, stamp)
-
     def _drive(self, odometry: OdometryPose) -> list[Update]:
         """The driving odometry moves on: keyframes that were asked for, then one of its own if it is due."""
         self._mounts.name_base(odometry.child)
         pose = self.space.pose(odometry.pose.tolist())
         self.track.add(odometry.stamp, pose, self._odometry_noise(odometry, pose))
         updates: list[Update] = []
-        while self._asked and self._asked[0] <= odometry.stamp:
-            stamp = heappop(self._asked)
+        for stamp in self._waiting.asked(odometry.stamp):
             if self.track.covers(stamp) and (self._newest is None or stamp > self._newest[0].stamp):
                 updates += self._extend(stamp)
         if self._newest is None:
@@ -217,18 +196,16 @@ class Backend:
     def _extend(self, stamp: int) -> list[Update]:
         """A new keyframe at a stamp that the odometry covers, with everything that lands there."""
         a = self._newest[0] if self._newest else None
-        b = keyframe(len(self.timeline), stamp)
-        self.timeline.add(b)
         if a is None:
-            delta = self._gauge(b)
+            b, delta = self._growth.start(stamp)
         else:
-            self.parts.put(b.pose, a.pose)
-            here = self._context({})
+            b = self._growth.follow(a, stamp)
             odometry = [Offer("", Measurement(stamp, str(self._driver)))]
-            delta = SENSORS["odometry"].factors(odometry, a, b, here, self.config.sources[str(self._driver)])
+            settings = self.config.sources[str(self._driver)]
+            delta = SENSORS["odometry"].factors(odometry, a, b, self._context({}), settings)
         self._newest = (b, self.track.pose(stamp))
         self.track.protect()
-        window = self._window(stamp)
+        window = self._waiting.window(stamp)
         return self._update(b, delta + self._factors(window, a, b, delta.values), [b], window)
 
     def _close(self, last: bool = False) -> list[Update]:
@@ -237,82 +214,19 @@ class Backend:
         last: the input has ended; what is newer than the newest keyframe lands now or never.
         """
         before = len(self.timeline)
-        growth, edges = self._grow()
+        growth, edges = self._growth.along(self._waiting.of(str(self._driver)), self._context)
         new = self.timeline.keyframes[before:]
         a = self._newest[0] if self._newest else None
         b = max(new, key=lambda k: k.stamp, default=a)
         if b is not None and (a is None or b.stamp > a.stamp):
             self._newest = (b, self.track.pose(b.stamp))
-        window = edges + (self._window(FAR if last else self._newest[0].stamp) if self._newest else [])
+        window = edges + (
+            self._waiting.window(FAR if last else self._newest[0].stamp) if self._newest else []
+        )
         if b is None or not window:
             self._decisions += growth.decisions
             return []
         return self._update(b, growth + self._factors(window, a, b, growth.values), new, window)
-
-    def _grow(self) -> tuple[Delta, list[Offer]]:
-        """New keyframes along the driving source's edges, each from an end that is known; a part of its own where
-        neither end is. Returns first guesses and gauges, and the edges, those that made keyframes marked.
-        """
-        grown: list[Delta] = []
-        guesses: dict[int, Any] = {}
-        marked: list[Offer] = []
-        edges = [offer for offer in self._pending if offer.measurement.source == self._driver]
-        self._pending = [offer for offer in self._pending if offer.measurement.source != self._driver]
-        while edges:
-            at = self.timeline.at
-            n = next(
-                (n for n, (_, m, _) in enumerate(edges) if any(at(stamp) for stamp in m.ends or ())), None
-            )
-            offer = edges.pop(n or 0)
-            m = offer.measurement
-            assert isinstance(m, RelativePose)
-            try:
-                step = relative.step(m, self._context(guesses))
-            except Unusable as why:
-                grown.append(Delta(decisions=(_refusal(offer, "relative", why.reason, why.detail),)))
-                continue
-            if n is None:
-                start = self._begin(m.stamp_i)
-                grown.append(start)
-                guesses.update(start.values)
-            i, j = at(m.stamp_i), at(m.stamp_j)
-            if i is not None and j is None:
-                guesses.update(self._branch(i, m.stamp_j, step, guesses))
-            elif j is not None and i is None:
-                guesses.update(self._branch(j, m.stamp_i, step.inverse(), guesses))
-            marked.append(offer._replace(motion=i is None or j is None))
-        return total(grown) + Delta(values=guesses), marked
-
-    def _begin(self, stamp: int) -> Delta:
-        first = keyframe(len(self.timeline), stamp)
-        self.timeline.add(first)
-        self.track.add(stamp, self.space.identity)
-        self.track.protect()
-        return self._gauge(first)
-
-    def _branch(self, known: Keyframe, stamp: int, step: Pose, guesses: Mapping[int, Any]) -> dict[int, Any]:
-        new = keyframe(len(self.timeline), stamp)
-        pose = guesses[known.pose] if known.pose in guesses else self.estimate.pose(known.pose)
-        self.timeline.add(new)
-        self.parts.put(new.pose, known.pose)
-        self.track.add(stamp, self.track.pose(known.stamp).compose(step))
-        self.track.protect()
-        return {new.pose: pose.compose(step)}
-
-    def _gauge(self, first: Keyframe) -> Delta:
-        """Begin a part of the graph: its first pose is the origin, until something absolute says otherwise."""
-        name = f"gauge/{format_stamp(first.stamp)}/0"
-        self.parts.begin(first.pose, name)
-        noise = noise_of(self.space.diagonal(GAUGE_SIGMA**2, GAUGE_SIGMA**2))
-        prior = self.space.prior(first.pose, self.space.identity, noise)
-        factor = Factor(name, "gauge", prior, (first.pose,), first.stamp)
-        return Delta((factor,), values={first.pose: self.space.identity})
-
-    def _window(self, until: int) -> list[Offer]:
-        """Take what waits for a keyframe at this stamp, late measurements included."""
-        window = [offer for offer in self._pending if offer.measurement.stamp <= until]
-        self._pending = [offer for offer in self._pending if offer.measurement.stamp > until]
-        return window
 
     def _factors(
         self, window: Sequence[Offer], a: Keyframe | None, b: Keyframe, guesses: Mapping[int, Any]
@@ -353,8 +267,7 @@ class Backend:
     ) -> list[Update]:
         """Solve: motion and all that nothing judges first, then what the robust stages let in."""
         self._decisions += delta.decisions
-        for wait in delta.waits:
-            self._wait(wait)
+        self._decisions += [self._waiting.wait(each) for each in delta.waits]
         judged = tuple(f for f in delta.add if any(f.kind in stage.kinds for stage in self._robust))
         sure = without(delta, {factor.id for factor in judged})
         try:
@@ -389,7 +302,7 @@ class Backend:
         self._newest = (last, self.track.pose(last.stamp)) if last else None
         refused = {d.id for d in (*self._decisions, *self._applier.decisions) if d.verdict == "refused"}
         lost = {factor.id for factor in delta.add} - refused - self.solver.factors.keys()
-        self._pending += [offer for offer in window if offer.id in lost]
+        self._waiting.again([offer for offer in window if offer.id in lost])
 
     def _told(self, b: Keyframe, guess: Pose | None = None) -> Update:
         """The update for the newest keyframe, with the decisions since the last one."""
@@ -401,38 +314,3 @@ class Backend:
         decisions = (*self._decisions, *self._applier.take_decisions())
         self._decisions = []
         return Update(b, self.space.seven(pose), self.space.seven(correction), self._revision, decisions)
-
-    # -- what waits ------------------------------------------------------------------------------
-
-    def _wait(self, wait: Wait) -> None:
-        self._waiting[wait.until].append(wait)
-        m = wait.offer.measurement
-        self._decisions.append(
-            Decision(
-                m.stamp,
-                wait.offer.id,
-                m.source,
-                "probation",
-                "wait",
-                "undetermined",
-                wait.reason,
-                ends=m.ends,
-            )
-        )
-
-    def _wake(self, key: int) -> None:
-        """A variable exists now, or parts were joined: what waited for it is offered again."""
-        self._pending += [wait.offer for wait in self._waiting.pop(key, ())]
-
-    def _refuse_leftovers(self) -> None:
-        """At the end of the input: what no keyframe ever covered, and what waited in vain."""
-        for offer in self._pending:
-            self._decisions.append(_refusal(offer, "backend", "uncovered", "no trajectory at its stamp"))
-        for wait in (wait for waits in self._waiting.values() for wait in waits):
-            self._decisions.append(_refusal(wait.offer, "wait", "undetermined", wait.reason))
-        self._pending, self._waiting = [], defaultdict(list)
-
-
-def _refusal(offer: Offer, stage: str, reason: str, detail: str) -> Decision:
-    m = offer.measurement
-    return Decision(m.stamp, offer.id, m.source, "refused", stage, reason, detail, ends=m.ends)

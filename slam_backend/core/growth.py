@@ -1,0 +1,93 @@
+"""New keyframes: one at a time along the odometry, or, without odometry, along the edges of relative poses."""
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from .context import Context, Unusable
+from .graph import Delta, Factor, Keyframe, Offer, Pose, keyframe, total
+from .keyframes import Timeline, Track
+from .measurement import format_stamp
+from .parts import Parts
+from .robust.kernels import noise_of
+from .sensors import relative
+from .sensors.relative import RelativePose
+from .space import Space
+from .waiting import refusal
+
+GAUGE_SIGMA = 1e-3  # m and rad; of the prior that fixes a part of the graph in space
+
+
+class Growth:
+    """Books new keyframes in the timeline, the parts and, where edges are the odometry, the track."""
+
+    def __init__(self, space: Space, timeline: Timeline, track: Track, parts: Parts) -> None:
+        self._space, self._timeline, self._track, self._parts = space, timeline, track, parts
+
+    def start(self, stamp: int) -> tuple[Keyframe, Delta]:
+        """A part of its own: its first pose is the origin, until something absolute says otherwise."""
+        first = self._added(stamp)
+        name = f"gauge/{format_stamp(stamp)}/0"
+        self._parts.begin(first.pose, name)
+        origin, noise = self._space.identity, noise_of(self._space.diagonal(GAUGE_SIGMA**2, GAUGE_SIGMA**2))
+        factor = Factor(name, "gauge", self._space.prior(first.pose, origin, noise), (first.pose,), stamp)
+        return first, Delta((factor,), values={first.pose: origin})
+
+    def follow(self, a: Keyframe, stamp: int) -> Keyframe:
+        """The next keyframe after a, in its part."""
+        b = self._added(stamp)
+        self._parts.put(b.pose, a.pose)
+        return b
+
+    def along(
+        self, edges: list[Offer], context_of: Callable[[Mapping[int, Any]], Context]
+    ) -> tuple[Delta, list[Offer]]:
+        """Keyframes along edges, each from an end that is known; a part of its own where neither end is.
+
+        Returns first guesses and gauges, and the edges, those that made keyframes marked.
+        """
+        grown: list[Delta] = []
+        guesses: dict[int, Any] = {}
+        marked: list[Offer] = []
+        at = self._timeline.at
+        while edges:
+            n = next(
+                (n for n, (_, m, _) in enumerate(edges) if any(at(stamp) for stamp in m.ends or ())), None
+            )
+            offer = edges.pop(n or 0)
+            m = offer.measurement
+            assert isinstance(m, RelativePose)
+            context = context_of(guesses)
+            try:
+                step = relative.step(m, context)
+            except Unusable as why:
+                grown.append(Delta(decisions=(refusal(offer, "relative", why.reason, why.detail),)))
+                continue
+            if n is None:
+                grown.append(self._root(m.stamp_i))
+                guesses.update(grown[-1].values)
+            i, j = at(m.stamp_i), at(m.stamp_j)
+            if i is not None and j is None:
+                guesses.update(self._branch(i, m.stamp_j, step, context))
+            elif j is not None and i is None:
+                guesses.update(self._branch(j, m.stamp_i, step.inverse(), context))
+            marked.append(offer._replace(motion=i is None or j is None))
+        return total(grown) + Delta(values=guesses), marked
+
+    def _root(self, stamp: int) -> Delta:
+        _, delta = self.start(stamp)
+        self._tracked(stamp, self._space.identity)
+        return delta
+
+    def _branch(self, known: Keyframe, stamp: int, step: Pose, context: Context) -> dict[int, Any]:
+        new = self.follow(known, stamp)
+        self._tracked(stamp, self._track.pose(known.stamp).compose(step))
+        return {new.pose: context.pose(known.pose).compose(step)}
+
+    def _added(self, stamp: int) -> Keyframe:
+        new = keyframe(len(self._timeline), stamp)
+        self._timeline.add(new)
+        return new
+
+    def _tracked(self, stamp: int, pose: Pose) -> None:
+        self._track.add(stamp, pose)
+        self._track.protect()

@@ -1,0 +1,92 @@
+"""Measurements on their way: for a keyframe that covers them, or for a variable that they need."""
+
+from collections import defaultdict
+from collections.abc import Callable
+from heapq import heappop, heappush
+
+from .config import Config
+from .errors import BadConfig
+from .graph import Decision, Offer, Wait, identify
+from .measurement import Measurement
+
+
+class Waiting:
+    """All that has been offered and is not in the graph yet."""
+
+    def __init__(self, config: Config) -> None:
+        self._sources = config.sources
+        self._pending: list[Offer] = []
+        self._asked: list[int] = []  # stamps at which a source wants a keyframe
+        self._undetermined: dict[int, list[Wait]] = defaultdict(list)
+        self._counts: dict[str, dict[int, int]] = defaultdict(dict)
+
+    def __bool__(self) -> bool:
+        return bool(self._pending)
+
+    @property
+    def newest(self) -> int:
+        """Stamp of what was offered last."""
+        return self._pending[-1].measurement.stamp
+
+    def offer(self, measurement: Measurement) -> None:
+        """A measurement gets its id: the source, the stamp, and how many of that source had the same stamp before."""
+        source = self._sources.get(measurement.source)
+        if source is None:
+            raise BadConfig(f"there is no source '{measurement.source}'; known: {', '.join(self._sources)}")
+        counts = self._counts[measurement.source]
+        n = counts[measurement.stamp] = counts.get(measurement.stamp, -1) + 1
+        self._pending.append(Offer(identify(measurement, n), measurement))
+        if getattr(source, "keyframe", False):
+            for stamp in measurement.ends or (measurement.stamp,):
+                heappush(self._asked, stamp)
+
+    def again(self, offers: list[Offer]) -> None:
+        """What could not land this time."""
+        self._pending += offers
+
+    def asked(self, until: int) -> list[int]:
+        """Take the stamps up to `until` at which keyframes are wanted, in order."""
+        stamps = []
+        while self._asked and self._asked[0] <= until:
+            stamps.append(heappop(self._asked))
+        return stamps
+
+    def window(self, until: int) -> list[Offer]:
+        """Take what lands at a keyframe with this stamp, late measurements included."""
+        return self._take(lambda measurement: measurement.stamp <= until)
+
+    def of(self, source: str) -> list[Offer]:
+        """Take all that one source has offered."""
+        return self._take(lambda measurement: measurement.source == source)
+
+    def _take(self, wanted: Callable[[Measurement], bool]) -> list[Offer]:
+        taken = [offer for offer in self._pending if wanted(offer.measurement)]
+        self._pending = [offer for offer in self._pending if not wanted(offer.measurement)]
+        return taken
+
+    def wait(self, wait: Wait) -> Decision:
+        """Keep a measurement until its variable exists."""
+        self._undetermined[wait.until].append(wait)
+        m = wait.offer.measurement
+        return Decision(
+            m.stamp, wait.offer.id, m.source, "probation", "wait", "undetermined", wait.reason, ends=m.ends
+        )
+
+    def wake(self, key: int) -> None:
+        """A variable exists now, or parts were joined: what waited for it is offered again."""
+        self._pending += [wait.offer for wait in self._undetermined.pop(key, ())]
+
+    def leftovers(self) -> list[Decision]:
+        """At the end of the input: refuse what no keyframe ever covered, and what waited in vain."""
+        decisions = [
+            refusal(each, "backend", "uncovered", "no trajectory at its stamp") for each in self._pending
+        ]
+        for waits in self._undetermined.values():
+            decisions += [refusal(wait.offer, "wait", "undetermined", wait.reason) for wait in waits]
+        self._pending, self._undetermined = [], defaultdict(list)
+        return decisions
+
+
+def refusal(offer: Offer, stage: str, reason: str, detail: str) -> Decision:
+    m = offer.measurement
+    return Decision(m.stamp, offer.id, m.source, "refused", stage, reason, detail, ends=m.ends)
