@@ -97,7 +97,7 @@ class Player:
         pace = _Pace(rate, self._begin)
         for n, record in enumerate(self._records):
             while (left := pace.left(n, record.log_time)) > 0:
-                sleep(min(left, TICK) if self._clock else left)
+                sleep(min(left, max(self._told + TICK - monotonic(), 0)) if self._clock else left)
                 self._tell_time(min(pace.now(record.log_time), record.log_time))
             self._tell_time(record.log_time)
             output = self._outputs[record.topic]
@@ -128,6 +128,8 @@ class Player:
                 return _Output(name, kind, self._publisher(kind, name, self._depth))
             except InvalidTopicNameException:
                 why = f"'{name}' is no topic name in ROS 2; give it another with --remap"
+            except RuntimeError as error:  # RCLError: another topic of another type is played to that name
+                why = str(error).partition(", at /")[0]
         self.skipped.append(f"{topic} ({kind}): {why}")
         return None
 
