@@ -7,15 +7,12 @@ from collections.abc import Iterable, Mapping
 from difflib import get_close_matches
 from pathlib import Path
 from time import monotonic
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 
 from ..core.errors import BadConfig, BadFile, MissingExtra
 from .progress import progress
-
-if TYPE_CHECKING:
-    from ..ros.player import Player
 
 PARTING = 1.0  # s for acknowledgements after Ctrl-C
 
@@ -101,8 +98,8 @@ def _instead(name: str, known: Iterable[str]) -> str:
     return f"; did you mean '{close[0]}'?" if close else f"; there are {', '.join(known) or 'none'}"
 
 
-def _play(player: "Player", rate: float, wait: float) -> dict[str, Any]:
-    """Play to the end or to Ctrl-C, and tell how it went."""
+def _play(player: Any, rate: float, wait: float) -> dict[str, Any]:
+    """Play to the end or to Ctrl-C, and tell how it went. player: a ros.player.Player, which needs rclpy."""
     lonely: list[str] = []
     begin, interrupted, behind = monotonic(), False, []
     try:
