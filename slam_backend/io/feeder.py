@@ -1,27 +1,59 @@
 """Keeps a worker alive and fed: journal -> pipe -> worker -> reports.
 
-Two threads: one feeds rows from the journal, one reads what comes back. A worker that dies is started anew and fed
-from the first row, so it ends where the other would have.
+A worker that dies is started anew and fed from the first row, so it ends where the other would have. What the dead one
+had reported is not told again: the new one gets its rows up to the very row of that report, and is silent until there.
 """
 
 import multiprocessing
+import signal
+import sqlite3
 import threading
-from collections.abc import Callable, Mapping
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager, suppress
 from itertools import count
-from multiprocessing.connection import Connection
+from multiprocessing.resource_tracker import ensure_running
 from typing import Any
 
 from ..core.config import Config
 from ..core.errors import SlamError
 from .journal import Journal, JournalReader
-from .worker import Answer, Report, Request, RequestName, serve
+from .worker import Answer, Failure, Report, Request, RequestName, serve
 
 BATCH = 500  # rows in one message to the worker
 PATIENCE = 0.1  # s between two looks at whether to stop
+FAREWELL = 1.0  # s that a worker may take to end after its last answer
+LONGEST_PAUSE = 10.0  # s before a worker that dies at the same row again and again gets a successor
+LOST = "the worker ended before it answered"
+
+
+class _Worker:
+    """One process, and how far it has come. quiet_until: the row up to which its reports have been told already."""
+
+    def __init__(self, config: Config, table: Mapping[str, tuple[str, str]], quiet_until: int) -> None:
+        context = multiprocessing.get_context("spawn")  # a forked copy of DDS's threads would deadlock
+        self.pipe, theirs = context.Pipe()
+        self.process = context.Process(target=serve, args=(theirs, config, table), daemon=True)
+        with undisturbed():
+            self.process.start()
+        theirs.close()
+        self.sent = self.applied = 0
+        self.quiet_until = quiet_until
+        self.quiet = quiet_until > 0
+        self.asked: list[int] = []  # ids of requests sent and not answered
+        self.finishing = self.gone = False
+        self.failure = ""
+
+    def end(self, patience: float = 0.0) -> None:
+        """After at most `patience` s there is no process any more."""
+        self.process.join(patience)
+        if self.process.is_alive():
+            self.process.kill()
+            self.process.join()
 
 
 class Feeder:
-    """told: called with every Report, in a thread of its own. died: called with one line whenever a worker was lost."""
+    """told: called with every Report, in a thread of its own. died: called there with one line whenever a worker was lost."""
 
     def __init__(
         self,
@@ -33,116 +65,203 @@ class Feeder:
     ) -> None:
         self._journal, self._config, self._table = journal, config, table
         self._told, self._died = told, died
+        self._begin = (
+            journal.committed
+        )  # rows that lie behind: a request is not answered before they are read
+        self._told_to = 0
         self._ids = count(1)
-        self._answers: dict[int, Answer] = {}
+        self._requests: deque[Request] = deque()
+        self._last: Request | None = None
+        self._answers: dict[int, Answer | None] = {}  # None: still to come
         self._answered = threading.Condition()
-        self._sending = threading.Lock()
-        self._stop = threading.Event()
-        self._hold = threading.Event()  # set while paused
-        self.sent = 0
+        self._stop, self._hold = threading.Event(), threading.Event()
         self.restarts = 0
-        self._start()
+        self._worker = _Worker(config, table, 0)
+        self._thread = threading.Thread(target=self._keep, name="feeder", daemon=True)
+        self._thread.start()
 
     @property
     def alive(self) -> bool:
-        return self._process.is_alive()
+        return self._worker.process.is_alive()
 
     @property
     def pid(self) -> int | None:
-        return self._process.pid
+        return self._worker.process.pid
 
     @property
     def backlog(self) -> int:
         """Rows that the worker has not read yet."""
-        return max(self._journal.committed - self._applied, 0)
+        return max(self._journal.committed - self._worker.applied, 0)
 
     def pause(self, on: bool) -> None:
         """While paused, records are journaled but not fed."""
         self._hold.set() if on else self._hold.clear()
 
     def request(self, name: RequestName, argument: str = "", timeout: float = 10.0) -> Any:
-        """Ask the worker, between two records. SlamError when it cannot, or not in time (s)."""
+        """Ask the worker, between two batches of rows. SlamError when it cannot, or not in time (s)."""
         request = Request(next(self._ids), name, argument)
-        self._send(request)
         with self._answered:
-            if not self._answered.wait_for(lambda: request.id in self._answers or not self.alive, timeout):
-                raise SlamError(
-                    f"the worker did not answer '{name}' within {timeout:g} s: it is busy or lost"
-                )
-            answer = self._answers.pop(request.id, Answer(request.id, error="the worker ended before it answered"))
+            self._answers[request.id] = None
+        if name == "finish":
+            self._last = request
+        else:
+            self._requests.append(request)
+        self._journal.nudge()
+        with self._answered:
+            self._answered.wait_for(
+                lambda: self._answers[request.id] is not None or self._stop.is_set(), timeout
+            )
+            answer = self._answers.pop(request.id)
+        if answer is None:
+            why = (
+                "it has been ended"
+                if self._stop.is_set()
+                else f"not within {timeout:g} s: it is busy or lost"
+            )
+            raise SlamError(f"the worker did not answer '{name}': {why}")
         if answer.error:
             raise SlamError(answer.error)
         return answer.content
 
     def finish(self, folder: str, timeout: float) -> Any:
-        """Feed what is left of the journal, flush, save the run at `folder`, end the worker; the run's summary."""
+        """Feed what is left of the journal, flush, save the run at `folder`, end the worker; the run's summary.
+
+        SlamError if that was not done in time (s). A worker that dies meanwhile gets a successor.
+        """
         self._hold.clear()
-        while self.sent < self._journal.committed and self._process.is_alive():
-            self._stop.wait(PATIENCE / 10)
-        self._stop.set()
         try:
-            return self.request("finish", folder, timeout)
+            summary = self.request("finish", folder, timeout)
+            self._worker.end(FAREWELL)
+            return summary
         finally:
             self.close()
 
     def close(self) -> None:
+        """No process and no thread is left; what was asked is not answered."""
         self._stop.set()
-        self._pipe.close()
-        self._process.join(1.0)
-        if self._process.is_alive():
-            self._process.kill()
-            self._process.join()
-
-    def _start(self) -> None:
-        context = multiprocessing.get_context("spawn")  # a forked copy of DDS's threads would deadlock
-        self._pipe, theirs = context.Pipe()
-        self._process = context.Process(target=serve, args=(theirs, self._config, self._table), daemon=True)
-        self._process.start()
-        theirs.close()
-        self.sent = self._applied = 0
-        for work in (self._feed, self._read):
-            threading.Thread(target=work, args=(self._pipe,), name=work.__name__, daemon=True).start()
-
-    def _send(self, message: Any) -> None:
-        try:
-            with self._sending:
-                self._pipe.send(message)
-        except OSError as error:
-            raise SlamError(f"the worker is lost: {error}") from None
-
-    def _feed(self, pipe: Connection) -> None:
-        """One thread for each worker, until it is lost or there is no more to come."""
-        reader = JournalReader(self._journal.path)
-        while pipe is self._pipe and not (self._stop.is_set() and self.sent >= self._journal.committed):
-            if self._hold.is_set() or not self._journal.wait(self.sent, PATIENCE):
-                self._stop.wait(PATIENCE if self._hold.is_set() else 0)
-                continue
-            rows = reader.after(self.sent, BATCH)
-            try:
-                self._send(rows)
-            except SlamError:
-                break  # the reading thread sees the end of the pipe, and starts another worker
-            self.sent = rows[-1].id
-        reader.close()
-
-    def _read(self, pipe: Connection) -> None:
-        while True:
-            try:
-                message = pipe.recv()
-            except (EOFError, OSError):
-                break
-            if isinstance(message, Report):
-                self._applied = message.applied
-                self._told(message)
-            else:
-                with self._answered:
-                    self._answers[message.id] = message
-                    self._answered.notify_all()
+        self._journal.nudge()
         with self._answered:
             self._answered.notify_all()
-        if not self._stop.is_set():
-            self._process.join()
-            code = self._process.exitcode
+        self._worker.end()
+        if self._thread is not threading.current_thread():
+            self._thread.join()
+
+    # -- one worker after the other ----------------------------------------------------------------
+
+    def _keep(self) -> None:
+        deaths, furthest = 0, 0  # in a row, without any progress
+        while True:
+            worker = self._worker
+            feeding = threading.Thread(target=self._feed, args=(worker,), name="rows", daemon=True)
+            feeding.start()
+            self._read(worker)
+            worker.end(FAREWELL)
+            worker.gone = True
+            self._journal.nudge()
+            feeding.join()
+            worker.pipe.close()
+            if self._stop.is_set() or self._is_finished():
+                return
+            deaths, furthest = (deaths + 1, furthest) if worker.applied <= furthest else (0, worker.applied)
+            self._fail_requests(worker)
             self.restarts += 1
-            self._died(f"the worker ended with code {code}; another one reads the journal from its start")
-            self._start()
+            why = worker.failure or f"it ended with code {worker.process.exitcode}"
+            self._died(f"the worker was lost ({why}); another one reads the journal from its start")
+            self._stop.wait(min(PATIENCE * 2**deaths, LONGEST_PAUSE) if deaths else 0)
+            self._worker = _Worker(self._config, self._table, self._told_to)
+            if self._stop.is_set():
+                self._worker.end()  # close() may have seen the one before only
+
+    def _is_finished(self) -> bool:
+        """Whether the last request has been answered, or its asker is gone."""
+        last = self._last
+        return last is not None and self._answers.get(last.id, Answer(last.id)) is not None
+
+    def _fail_requests(self, worker: _Worker) -> None:
+        with self._answered:
+            for asked in worker.asked:
+                if asked in self._answers and not (self._last and asked == self._last.id):
+                    self._answers[asked] = Answer(asked, error=LOST)
+            self._answered.notify_all()
+
+    # -- to the worker -----------------------------------------------------------------------------
+
+    def _feed(self, worker: _Worker) -> None:
+        """A thread for each worker: the only one that writes to its pipe."""
+        with suppress(OSError):  # the pipe is broken: the reading thread sees its end too
+            while not (worker.gone or self._stop.is_set()):
+                try:
+                    self._feed_from(JournalReader(self._journal.path), worker)
+                except sqlite3.Error as error:
+                    self._died(f"{self._journal.path}: cannot be read: {error}")
+                    self._stop.wait(LONGEST_PAUSE)
+
+    def _feed_from(self, reader: JournalReader, worker: _Worker) -> None:
+        try:
+            while not (worker.gone or self._stop.is_set()):
+                request = self._due(worker)
+                if request is not None:
+                    worker.asked.append(request.id)
+                    worker.pipe.send(request)
+                elif not self._hold.is_set() and self._journal.committed > worker.sent:
+                    left = worker.quiet_until - worker.sent
+                    rows = reader.after(worker.sent, min(BATCH, left) if left > 0 else BATCH)
+                    worker.pipe.send(rows)
+                    worker.sent = rows[-1].id
+                else:
+                    after = self._journal.committed if self._hold.is_set() else worker.sent
+                    self._journal.wait(after, PATIENCE, lambda: bool(self._requests) or worker.gone)
+        finally:
+            reader.close()
+
+    def _due(self, worker: _Worker) -> Request | None:
+        """The next request, once the worker has been given what a former one had read; the last one after all rows."""
+        if worker.sent < max(worker.quiet_until, self._begin):
+            return None
+        while self._requests:
+            request = self._requests.popleft()
+            if request.id in self._answers:  # else its asker has given up
+                return request
+        if self._last is None or worker.finishing or worker.sent < self._journal.committed:
+            return None
+        worker.finishing = True
+        return self._last
+
+    # -- from the worker ---------------------------------------------------------------------------
+
+    def _read(self, worker: _Worker) -> None:
+        with suppress(EOFError, OSError):
+            while True:
+                message = worker.pipe.recv()
+                if isinstance(message, Report):
+                    self._report(worker, message)
+                elif isinstance(message, Failure):
+                    worker.failure = message.what
+                else:
+                    self._answer(worker, message)
+
+    def _report(self, worker: _Worker, report: Report) -> None:
+        worker.applied = report.applied
+        if not worker.quiet:
+            self._told_to = report.applied
+            self._told(report)
+        elif report.applied >= worker.quiet_until:
+            worker.quiet = False
+
+    def _answer(self, worker: _Worker, answer: Answer) -> None:
+        with self._answered:
+            worker.asked.remove(answer.id)
+            if answer.id in self._answers:  # else its asker has given up
+                self._answers[answer.id] = answer
+                self._answered.notify_all()
+
+
+@contextmanager
+def undisturbed() -> Iterator[None]:
+    """Start processes that SIGINT and SIGTERM do not reach before they have said what these are to do there."""
+    ensure_running()  # multiprocessing's own process, whose start would undo the mask
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT, signal.SIGTERM})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)

@@ -2,13 +2,15 @@
 
 A callback of the node only appends to a queue; a writer thread of its own commits to SQLite (WAL), many records at a
 time. Whoever feeds the worker reads the rows back from the file, so that a worker that died is fed again from the
-first row, and a slow one fills no memory. Log times are strictly increasing: readers order by them.
+first row, and a slow one fills no memory. Log times are strictly increasing: readers order by them. A file that cannot
+be written (disk full) is tried again every second, while records wait in memory.
 """
 
 import sqlite3
 import threading
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from time import time_ns
 from typing import NamedTuple
@@ -19,6 +21,8 @@ from .typestore import typestore_of
 
 NAME = "journal.db3"
 COMMIT_DELAY = 0.05  # s that a record may wait for others before it is committed
+LIMIT = 200_000  # records that wait in memory while the file cannot be written; what comes then is lost
+RETRY = 1.0  # s between two attempts to write
 SCHEMA = """
 CREATE TABLE IF NOT EXISTS schema(schema_version INTEGER PRIMARY KEY, ros_distro TEXT NOT NULL);
 CREATE TABLE IF NOT EXISTS metadata(id INTEGER PRIMARY KEY, metadata_version INTEGER NOT NULL, metadata TEXT NOT NULL);
@@ -40,20 +44,25 @@ class Row(NamedTuple):
 
 
 class Journal:
-    """Append from any thread; `committed` is the id of the newest row that readers can see."""
+    """Append from any thread; `committed` is the id of the newest row that readers can see.
+
+    lost: records that could not be kept, since the file could not be written for long.
+    """
 
     def __init__(self, folder: Path, failed: Callable[[str], None]) -> None:
-        """Open or continue the journal in a folder. BadFile if it cannot be. failed: told once, in words, when writing fails."""
+        """Open or continue the journal in a folder. BadFile if it cannot be. failed: told in words when writing begins to fail."""
         self.path = folder / NAME
-        self.committed = 0
+        self.committed = self.lost = 0
         self._failed = failed
         self._queue: deque[tuple[str, str, int, bytes]] = deque()
+        self._arrival = threading.Lock()
         self._wake, self._stop = threading.Event(), threading.Event()
         self._grown = threading.Condition()
         self._newest = 0
         try:
             folder.mkdir(parents=True, exist_ok=True)
-            with _connect(self.path) as database:
+            self._database = _connect(self.path, "rwc")
+            with self._database as database:
                 database.executescript(SCHEMA)
                 database.execute("INSERT OR IGNORE INTO schema VALUES (4, 'jazzy')")
                 self.committed, self._newest = database.execute(
@@ -64,25 +73,39 @@ class Journal:
         self._thread = threading.Thread(target=self._write, name="journal", daemon=True)
         self._thread.start()
 
+    @property
+    def waiting(self) -> int:
+        """Records that are in memory only."""
+        return len(self._queue)
+
     def append(self, topic: str, type_: str, data: bytes) -> None:
         """Never blocks."""
-        self._newest = max(self._newest + 1, time_ns())
-        self._queue.append((topic, type_, self._newest, data))
+        if len(self._queue) >= LIMIT:
+            self.lost += 1
+            return
+        with self._arrival:  # the order of the queue is that of the log times
+            self._newest = max(self._newest + 1, time_ns())
+            self._queue.append((topic, type_, self._newest, data))
         self._wake.set()
 
-    def wait(self, after: int, timeout: float) -> bool:
-        """Until there are rows beyond `after`, or the timeout (s) has passed."""
+    def wait(self, after: int, timeout: float, unless: Callable[[], bool] = lambda: False) -> bool:
+        """Until there are rows beyond `after` or, after a nudge, something else is true, or the timeout (s) has passed."""
         with self._grown:
-            return self._grown.wait_for(lambda: self.committed > after, timeout)
+            return self._grown.wait_for(lambda: self.committed > after or unless(), timeout)
+
+    def nudge(self) -> None:
+        """Let those who wait look at their `unless`."""
+        with self._grown:
+            self._grown.notify_all()
 
     def close(self) -> None:
-        """Commit what is queued."""
+        """Commit what is queued; afterwards the one file holds everything."""
         self._stop.set()
         self._wake.set()
         self._thread.join()
 
     def _write(self) -> None:
-        database = _connect(self.path)
+        database, failing = self._database, False
         topics = {
             (name, type_): id_ for id_, name, type_ in database.execute("SELECT id, name, type FROM topics")
         }
@@ -90,40 +113,52 @@ class Journal:
             self._wake.wait()
             self._wake.clear()
             self._stop.wait(COMMIT_DELAY)
-            batch = [self._queue.popleft() for _ in range(len(self._queue))]
+            batch = [self._queue[n] for n in range(len(self._queue))]  # they stay until they are in the file
             try:
-                self._commit(database, topics, batch)
+                topics |= self._commit(database, topics, batch)
+                failing = False
             except sqlite3.Error as error:
-                self._queue.extendleft(reversed(batch))
-                self._failed(f"{self.path}: cannot be written: {error}")
-                self._stop.wait(1.0)
-                if self._stop.is_set():
+                if not failing:
+                    self._failed(f"{self.path}: cannot be written: {error}; what comes waits in memory")
+                failing = True
+                if self._stop.wait(RETRY):
                     break
                 self._wake.set()
+        if self._queue:
+            self._failed(f"{self.path}: its last {len(self._queue)} records could not be written")
+        with suppress(sqlite3.Error):  # the file and its -wal still hold everything together
+            database.execute("PRAGMA wal_checkpoint(TRUNCATE)")
         database.close()
 
     def _commit(
         self,
         database: sqlite3.Connection,
-        topics: dict[tuple[str, str], int],
-        batch: list[tuple[str, str, int, bytes]],
-    ) -> None:
+        topics: Mapping[tuple[str, str], int],
+        batch: Sequence[tuple[str, str, int, bytes]],
+    ) -> dict[tuple[str, str], int]:
+        """All or nothing; the ids of topics that were new."""
+        new: dict[tuple[str, str], int] = {}
         with database:
             for name, type_, _, _ in batch:
-                if (name, type_) not in topics:
-                    topics[name, type_] = _add_topic(database, name, type_)
-            rows = [(topics[name, type_], stamp, data) for name, type_, stamp, data in batch]
+                if (name, type_) not in topics and (name, type_) not in new:
+                    new[name, type_] = _add_topic(database, name, type_)
+            known = {**topics, **new}
+            rows = [(known[name, type_], stamp, data) for name, type_, stamp, data in batch]
             database.executemany("INSERT INTO messages(topic_id, timestamp, data) VALUES (?, ?, ?)", rows)
+        for _ in batch:
+            self._queue.popleft()
         with self._grown:
             self.committed += len(batch)
             self._grown.notify_all()
+        return new
 
 
 class JournalReader:
     """Rows in order of arrival, while the journal is being written; for one thread."""
 
     def __init__(self, path: Path) -> None:
-        self._database = _connect(path)
+        """sqlite3.Error if there is none."""
+        self._database = _connect(path, "rw")
 
     def after(self, id_: int, limit: int) -> list[Row]:
         """At most `limit` committed rows beyond an id."""
@@ -138,8 +173,9 @@ class JournalReader:
         self._database.close()
 
 
-def _connect(path: Path) -> sqlite3.Connection:
-    database = sqlite3.connect(path, check_same_thread=False)
+def _connect(path: Path, mode: str) -> sqlite3.Connection:
+    """mode: rw, or rwc to create it."""
+    database = sqlite3.connect(f"{path.absolute().as_uri()}?mode={mode}", uri=True, check_same_thread=False)
     database.execute("PRAGMA journal_mode=WAL")
     database.execute("PRAGMA synchronous=NORMAL")
     return database

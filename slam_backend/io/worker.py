@@ -7,7 +7,10 @@ stream as `replay`, so what runs live is what runs offline; a request is answere
 
 import resource
 import signal
+import sys
+import traceback
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from pathlib import Path
@@ -60,6 +63,13 @@ class Answer:
     id: int
     content: Any = None
     error: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Failure:
+    """The last word of a worker that cannot go on: what it failed at, in one line."""
+
+    what: str
 
 
 class LiveInputs:
@@ -179,6 +189,16 @@ class _Worker:
 
 def serve(pipe: Connection, config: Config, table: Mapping[str, tuple[str, str]]) -> None:
     """The process: topic -> (source, kind) in `table`. Ends when asked to finish, or when the node is gone."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the node's affair: it will ask to finish
-    signal.signal(signal.SIGTERM, signal.SIG_IGN)
-    _Worker(pipe, config, table).serve()
+    for wish in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(wish, signal.SIG_IGN)  # Ctrl-C is the node's affair: it will ask to finish
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT, signal.SIGTERM})
+    try:
+        _Worker(pipe, config, table).serve()
+    except BrokenPipeError:
+        pass  # the node is gone: nobody to tell
+    except Exception as error:  # noqa: BLE001  # a defect: the node says it, and starts another worker
+        place = traceback.extract_tb(error.__traceback__)[-1]
+        what = f"{type(error).__name__}: {' '.join(str(error).split())} at {place.filename}:{place.lineno}"
+        with suppress(OSError):
+            pipe.send(Failure(what))
+        sys.exit(1)
