@@ -3,7 +3,7 @@
 import json
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
@@ -28,6 +28,9 @@ def command(
         list[str] | None,
         typer.Option("--set", metavar="K=V", help="One setting, such as keyframes.distance=1.0"),
     ] = None,
+    final: Annotated[
+        Literal["none", "batch"], typer.Option(help="batch: end at the optimum of the kept factors.")
+    ] = "none",
     out: Annotated[Path | None, typer.Option(metavar="DIR", help="Default: runs/NAME of the input.")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print the summary as JSON.")] = False,
 ) -> None:
@@ -39,7 +42,7 @@ def command(
 
     target = out or Path("runs") / inputs[0].stem
     prepare(target)
-    run = replay(inputs, load_config(config) if config else None, settings or ())
+    run = replay(inputs, load_config(config) if config else None, settings or (), final)
     _watch(run)
     write_run(run.result, target)
     draw(run.result, target / "trajectory.png")

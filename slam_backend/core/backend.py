@@ -8,6 +8,7 @@ from typing import Any
 import gtsam
 import numpy as np
 
+from .adopted import Adopted
 from .apply import Applier, touched, without
 from .config import Config, LandmarkSource, OdometrySource, PoseSource, RelativeSource
 from .context import Context
@@ -123,6 +124,10 @@ class Backend:
         """Linearize everything anew at the present estimate; what iSAM2 believes rests on older points."""
         if self._newest:
             self._applier.estimate = self.solver.polish()
+
+    def adopt(self, values: gtsam.Values) -> None:
+        """Believe what a batch solve of the same factors found, until the next measurement."""
+        self._applier.estimate = Adopted(values, self.space, self.estimate)
 
     @property
     def estimate(self) -> Estimate:

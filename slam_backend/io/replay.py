@@ -8,7 +8,7 @@ from functools import cached_property
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from time import perf_counter
-from typing import Any
+from typing import Any, Literal
 
 import gtsam
 import numpy as np
@@ -22,22 +22,27 @@ from ..core.fingerprint import run_hash
 from ..core.graph import Decision, Factor
 from ..core.measurement import SECOND, Measurement
 from ..core.settle import settled
+from ..core.solvers.batch import Solution, polish
 from ..core.trajectory import Snapshot, Trajectory
 from .configfile import configured
 from .discover import discover
 from .inputs import Inputs, open_inputs
 
+Final = Literal["none", "batch"]
 RECENT = 500  # updates
 VERSIONS = ("slam_backend", "gtsam", "numpy", "rosbags")
 
 
 def replay(
-    inputs: Path | str | Sequence[Path | str], config: Config | None = None, settings: Sequence[str] = ()
+    inputs: Path | str | Sequence[Path | str],
+    config: Config | None = None,
+    settings: Sequence[str] = (),
+    final: Final = "none",
 ) -> "Run":
     """Replay bags, journals or a pose graph. Iterate the Run for its updates, or ask for its `result`.
 
     config: without one, or without sources in it, these are found by the types of the topics. settings: `key=value`, applied
-    to what was found. SlamError says what is wrong with the input.
+    to what was found. final: `batch` ends at the optimum of the kept factors. SlamError says what is wrong with the input.
     """
     paths = [inputs] if isinstance(inputs, Path | str) else list(inputs)
     opened = open_inputs(paths)
@@ -48,7 +53,7 @@ def replay(
             given = {} if config is None else config.model_dump(exclude_unset=True, exclude={"sources"})
             config = config_from({**config_to(found), **given}, "configuration")
         config = configured(config, settings)
-        return Run(opened, config, notes)
+        return Run(opened, config, notes, final)
     except BaseException:
         opened.close()
         raise
@@ -67,8 +72,10 @@ def settled_stream(
 class Run:
     """One replay. An iterator of updates; progress, early stop and fleets wrap it from outside."""
 
-    def __init__(self, inputs: Inputs, config: Config, notes: list[str]) -> None:
+    def __init__(self, inputs: Inputs, config: Config, notes: list[str], final: Final = "none") -> None:
         self.config, self.notes, self.inputs = config, notes, inputs
+        self._final = final
+        self.batch: Solution | None = None
         self.backend = Backend(config)
         self.decisions = DecisionLog()
         self.seconds = Seconds()
@@ -121,6 +128,9 @@ class Run:
             raise BadFile(_nothing(self))
         self._online_cost = cost(self.backend.solver.factors.values(), self.backend.estimate.values())
         self.backend.polish()
+        if self._final == "batch":
+            self.batch = polish(self.backend.solver.factors.values(), self.backend.estimate.values())
+            self.backend.adopt(self.batch.values)
         self.seconds.solve(perf_counter() - before, 0)
 
     def _take(self, updates: Sequence[Update]) -> Iterator[Update]:
@@ -215,6 +225,7 @@ class Result:
                 "online": run.online_cost,
                 "final": cost(self.factors, self.values),
             },
+            "batch": None if run.batch is None else _told(run.batch),
             "timing": run.seconds.summary(),
             "memory_mb": round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024, 1),
             "versions": versions(),
@@ -230,6 +241,12 @@ def cost(factors: Iterable[Factor], values: gtsam.Values) -> float:
         if factor.kind != "gauge":
             graph.add(factor.factor)
     return float(graph.error(values))
+
+
+def _told(batch: Solution) -> dict[str, Any]:
+    """How the final batch went."""
+    steps = [step._asdict() for step in batch.iterations]
+    return {"cost_initial": batch.cost_initial, "cost": batch.cost, "stop": batch.stop, "iterations": steps}
 
 
 def versions() -> dict[str, str]:

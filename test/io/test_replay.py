@@ -11,6 +11,7 @@ import pytest
 
 from slam_backend.core.errors import BadConfig, BadFile, SlamError
 from slam_backend.core.measurement import SECOND
+from slam_backend.core.solvers.batch import polish
 from slam_backend.io.bags import open_bag, write_bag
 from slam_backend.io.configfile import load_config
 from slam_backend.io.encode import encode_odometry
@@ -342,3 +343,17 @@ def test_a_graph_cannot_be_replayed_as_odometry(drive, tmp_path):
     path.write_text("VERTEX_SE2 0 0 0 0\nVERTEX_SE2 1 1 0 0\nEDGE_SE2 0 1 1 0 0 1 0 0 1 0 1\n")
     assert "is a pose graph: configure a source of kind relative" in said(path, drive[1], error=BadConfig)
     assert "replayed alone" in said([path, drive[0]], error=BadFile)
+
+
+def test_a_final_batch_ends_at_the_optimum_of_the_kept_factors(tmp_path) -> None:
+    """Poses, cost and hash are the batch's; what was believed online is kept beside them."""
+    drive = write_simulation(simulate("city", 1, Options(poses=600)), tmp_path / "drive.mcap")
+    config = load_config(drive.config)
+    plain, ended = (replay(drive.bag, config, final=final).result for final in ("none", "batch"))
+    again = polish(ended.factors, ended.values)
+    assert ended.summary["cost"]["final"] <= plain.summary["cost"]["final"] * (1 + 1e-12)
+    assert max(step.step for step in again.iterations) < 1e-7
+    assert ended.summary["cost"]["online"] == plain.summary["cost"]["online"]
+    assert ended.summary["batch"]["stop"]
+    assert plain.summary["batch"] is None
+    assert ended.summary["run_hash"] != plain.summary["run_hash"]

@@ -14,10 +14,28 @@ from .gauges import Layout, gauges, layout, space_of
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class Start:
+    """A start that has every variable; initialize.py makes some.
+
+    cost: of the initialization, where it has been computed. steps: what has been done from there already; settled: and
+    that was enough. found: the layout of the factors, where it is known.
+    """
+
+    values: gtsam.Values
+    name: str = "given"
+    why: str = ""
+    cost: float | None = None
+    steps: tuple[Step, ...] = ()
+    settled: str = ""
+    found: Layout | None = None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class Solution:
     """values: every variable of the start. found: the graph's parts; gauged: the poses that hold those that floated.
 
-    iterations: all that were done, in order. stop: why they ended. notes: what else people should know.
+    cost_initial: of the start, before its own steps. iterations: all that were done, in order. stop: why they ended.
+    notes: what else people should know.
     """
 
     values: gtsam.Values
@@ -32,7 +50,7 @@ class Solution:
 
 def solve(
     factors: Iterable[Factor],
-    start: gtsam.Values,
+    start: gtsam.Values | Start,
     options: Options | None = None,
     progress: Progress = unwatched,
 ) -> Solution:
@@ -40,7 +58,8 @@ def solve(
 
     progress: called after every iteration. SolverFailure if there is no edge, or the start's cost is not finite.
     """
-    return _solve(list(factors), start, options or Options(), progress, near=False)
+    begun = start if isinstance(start, Start) else Start(start)
+    return _solve(list(factors), begun, options or Options(), progress, near=False)
 
 
 def polish(
@@ -50,23 +69,21 @@ def polish(
     progress: Progress = unwatched,
 ) -> Solution:
     """From an estimate that is near, as iSAM2's: Gauss-Newton until the largest step is below `options.step`."""
-    return _solve(list(factors), values, options or Options(), progress, near=True)
+    return _solve(list(factors), Start(values), options or Options(), progress, near=True)
 
 
-def _solve(
-    factors: list[Factor], start: gtsam.Values, options: Options, progress: Progress, near: bool
-) -> Solution:
-    found = layout(factors, start)
-    touched = found.touched(start)
+def _solve(factors: list[Factor], start: Start, options: Options, progress: Progress, near: bool) -> Solution:
+    found = start.found or layout(factors, start.values)
+    touched = found.touched(start.values)
     held = gauges(factors, found, touched, space_of(factors))
     descent = Descent([*factors, *held], touched, options, progress)
     before = descent.cost
-    stop = "" if near else descent.run()
+    stop = start.settled or ("" if near else descent.run())
     if near or options.polish:
         stop = descent.polish()
-    values = gtsam.Values(start)
+    values = gtsam.Values(start.values)
     values.update(descent.values)
     return Solution(
-        values, before, descent.cost, tuple(descent.steps), stop, found,
-        tuple(factor.keys[0] for factor in held), tuple(descent.notes),
+        values, before if start.cost is None else start.cost, descent.cost, (*start.steps, *descent.steps), stop,
+        found, tuple(factor.keys[0] for factor in held), tuple(descent.notes),
     )  # fmt: skip

@@ -20,10 +20,13 @@ from .planar import Planar
 MethodName = Literal["lm", "gn", "dogleg"]
 
 NO_FALL, SMALL_STEP, LIMIT = "cost no longer falls", "step below tolerance", "iteration limit"
+SETTLED = "cost settled: each fall a small part of the last"
 ROUNDING = "step at the rounding of the numbers"
 BOUND, SINGULAR, RISES = "lambda at its bound", "singular system", "cost rises"
 
 DAMPED = 1e-4  # lambda above which a short step may have been the damping's wish
+FAST = 0.1  # of the last fall of the cost: Newton's convergence, where the falls that follow sum to less than 1.2 of the next
+REST = 10.0  # times `relative`: what may be left to fall then
 ZERO = 1e-8  # a cost below which every edge is met
 PATIENCE = 5  # iterations without a better cost after which Gauss-Newton is given up
 SHRINKS = 0.7  # of the last step: near the optimum, steps that shrink less than that are only rounding
@@ -135,6 +138,7 @@ class Descent:
     def _descend(self, method: MethodName) -> str:
         """Until the cost no longer falls. Gauss-Newton may climb on its way."""
         advance, at, before, worse = self._native(method), self.values, self.cost, 0
+        fell = 0.0
         bound = gtsam.LevenbergMarquardtParams().getlambdaUpperBound()
         while len(self.steps) < self._options.iterations:
             if (found := self._iterate(advance, at)) is None:
@@ -145,10 +149,18 @@ class Descent:
                 return RISES
             if cost >= before and method == "lm" and self.steps[-1].damping >= bound:
                 return BOUND
-            if abs(before - cost) <= self._options.relative * before or max(before, cost) < ZERO:
+            last, fell = fell, before - cost
+            if abs(fell) <= self._options.relative * before or max(before, cost) < ZERO:
                 return NO_FALL
+            if self._at_end(last, fell, cost):
+                return SETTLED
             before = cost
         return LIMIT
+
+    def _at_end(self, last: float, fell: float, cost: float) -> bool:
+        """Whether the cost falls so much faster each time that what is left, by the last two, need not be waited for."""
+        quick = 0 < fell < FAST * last and self.steps[-1].damping <= DAMPED
+        return quick and fell * fell / last <= REST * self._options.relative * cost
 
     def _settle(self) -> str:
         """Gauss-Newton by the length of its steps. A cost that rises beyond rounding ends it."""

@@ -5,9 +5,10 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
+import gtsam
 import numpy as np
 
-from ..graph import Factor, Pose
+from ..graph import Factor, Pose, is_pose
 from ..measurement import Array
 from ..space import Space
 from .gauges import Labels, Layout
@@ -60,11 +61,27 @@ def matrices_of(space: Space, poses: Sequence[Pose]) -> Array:
         return np.array([pose.matrix() for pose in poses]).reshape(-1, 4, 4)
     x, y, theta = np.array([space.numbers(pose) for pose in poses]).reshape(-1, 3).T
     matrices = np.zeros((len(x), 3, 3))
-    matrices[:, 0, 0] = matrices[:, 1, 1] = np.cos(theta)
-    matrices[:, 1, 0] = np.sin(theta)
-    matrices[:, 0, 1] = -matrices[:, 1, 0]
+    matrices[:, :2, :2] = _turned(theta)
     matrices[:, 0, 2], matrices[:, 1, 2], matrices[:, 2, 2] = x, y, 1.0
     return matrices
+
+
+def rotations_of(space: Space, values: gtsam.Values, found: Layout) -> Array:
+    """(N, d, d) of the layout's rows; identity for landmarks."""
+    keys = np.array([key for key in values.keys() if is_pose(key)], dtype=np.uint64)  # noqa: SIM118  # no mapping
+    here = np.flatnonzero(np.isin(found.keys, keys))
+    rows = np.searchsorted(keys, found.keys[here])
+    rotations = np.tile(np.eye(2 if space.name == "2d" else 3), (len(found.keys), 1, 1))
+    if space.name == "3d":
+        rotations[here] = gtsam.utilities.extractPose3(values)[rows, :9].reshape(-1, 3, 3)
+    else:
+        rotations[here] = _turned(gtsam.utilities.extractPose2(values)[rows, 2])
+    return rotations
+
+
+def _turned(angles: Array) -> Array:
+    c, s = np.cos(angles), np.sin(angles)
+    return np.stack([np.stack([c, -s], axis=1), np.stack([s, c], axis=1)], axis=1)
 
 
 def pose_of_matrix(space: Space, rotation: Array, translation: Array) -> Pose:

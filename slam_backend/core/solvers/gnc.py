@@ -10,7 +10,7 @@ from typing import NamedTuple
 import gtsam
 
 from ..graph import Factor
-from .batch import Solution, solve
+from .batch import Solution, Start, solve
 from .descent import Options, Progress, unwatched
 from .gauges import gauges, layout, space_of
 
@@ -26,15 +26,16 @@ class Judged(NamedTuple):
 
 def solve_gnc(
     factors: Iterable[Factor],
-    start: gtsam.Values,
+    start: gtsam.Values | Start,
     options: Options | None = None,
     progress: Progress = unwatched,
 ) -> Judged:
     """Judge the loops, then solve without those that are refused. No progress while gtsam judges."""
     factors, options = list(factors), options or Options()
-    refused = frozenset(_refused(factors, start, options))
+    values = start.values if isinstance(start, Start) else start
+    refused = frozenset(_refused(factors, values, options))
     kept = [factor for factor in factors if factor.id not in refused]
-    solution = solve(kept, start, options, progress)
+    solution = solve(kept, values, options, progress)
     return Judged(solution, tuple(factor.id for factor in factors if factor.id in refused))
 
 

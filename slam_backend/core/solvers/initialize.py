@@ -10,7 +10,7 @@ from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Literal, NamedTuple
+from typing import Literal
 
 import gtsam
 import numpy as np
@@ -19,24 +19,15 @@ from ..errors import BadConfig, SolverFailure
 from ..graph import Factor, Pose, is_pose
 from ..measurement import Array
 from ..space import Space
+from .batch import Start
 from .chordal import chordal
-from .descent import NO_FALL, Descent, Options, Progress, Step, unwatched
-from .edges import Edges, edges_of, matrices_of, pose_of_matrix, turns
+from .descent import NO_FALL, SETTLED, Descent, Options, Progress, unwatched
+from .edges import Edges, edges_of, pose_of_matrix, rotations_of, turns
 from .gauges import FIXING, Layout, gauges, layout, space_of
 
 InitializationName = Literal["auto", "file", "odometry", "chordal"]
 WOUND, UNWOUND = 2.0, 1.0  # rad: of a start, of the end that it led to
 TRIAL = 8  # iterations
-
-
-class Start(NamedTuple):
-    """A start that has every variable. cost: of the initialization; steps: what `auto` went on from there already."""
-
-    values: gtsam.Values
-    name: str
-    cost: float
-    steps: tuple[Step, ...] = ()
-    why: str = ""
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,6 +42,11 @@ class Ground:
     @cached_property
     def edges(self) -> Edges:
         return edges_of(self.factors, self.found, self.space)
+
+    @property
+    def states_all(self) -> bool:
+        """Whether the file states every pose that the factors touch."""
+        return all(self.stated.exists(key) for key in self.keys if is_pose(key))
 
     @cached_property
     def keys(self) -> list[int]:
@@ -82,64 +78,53 @@ def cost_of(factors: Sequence[Factor], values: gtsam.Values) -> float:
     return float(graph.error(values))
 
 
-def states_all(factors: Sequence[Factor], stated: gtsam.Values) -> bool:
-    """Whether there is a value for every pose that the factors touch."""
-    return all(stated.exists(key) for factor in factors for key in factor.keys if is_pose(key))
-
-
 def _chosen(ground: Ground, options: Options, progress: Progress) -> Start:
     tried = []
-    for name in ("file", "odometry") if states_all(ground.factors, ground.stated) else ("odometry",):
+    for name in ("file", "odometry") if ground.states_all else ("odometry",):
         start = _from(name, ground)
         if (wound := _wound(ground, start.values)) < WOUND:
-            return start._replace(why=f"no edge disagrees with it by more than {wound:.2g} rad")
-        tried.append(start)
-    nearest = min(tried, key=lambda start: start.cost)
-    ahead, cost, settled = _advanced(nearest, ground, options, progress)
-    if settled and _wound(ground, ahead.values) < UNWOUND:
-        return ahead._replace(why=f"settled within {TRIAL} iterations")
+            return replace(start, why=f"no edge disagrees with it by more than {wound:.2g} rad")
+        tried.append((cost_of(ground.factors, start.values), start))
+    nearest = min(tried, key=lambda pair: pair[0])[1]
+    ahead, cost = _advanced(nearest, ground, options, progress)
+    if ahead.settled and _wound(ground, ahead.values) < UNWOUND:
+        return replace(ahead, why=f"settled within {TRIAL} iterations")
     start = _from("chordal", ground)
-    if start.cost < cost:
-        return start._replace(
-            why=f"cost {start.cost:.6g}, against {cost:.6g} from {nearest.name} after {TRIAL} iterations"
-        )
-    other, other_cost, _ = _advanced(start, ground, options, progress)
+    if (of_chordal := cost_of(ground.factors, start.values)) < cost:
+        why = f"cost {of_chordal:.6g}, against {cost:.6g} from {nearest.name} after {TRIAL} iterations"
+        return replace(start, why=why)
+    other, other_cost = _advanced(start, ground, options, progress)
     best, worse = (other, cost) if other_cost < cost else (ahead, other_cost)
-    return best._replace(
-        why=f"costs after {TRIAL} iterations: {min(cost, other_cost):.6g}, the other {worse:.6g}"
-    )
+    costs = f"{min(cost, other_cost):.6g}, the other {worse:.6g}"
+    return replace(best, why=f"costs after {TRIAL} iterations: {costs}")
 
 
 def _from(name: str, ground: Ground) -> Start:
     values = _complete(INITIALIZATIONS[name](ground), ground)
-    return Start(values, name, cost_of(ground.factors, values))
+    return Start(values, name, found=ground.found)
 
 
-def _advanced(
-    start: Start, ground: Ground, options: Options, progress: Progress
-) -> tuple[Start, float, bool]:
-    """The start a few iterations on, its cost there, and whether it has settled already."""
+def _advanced(start: Start, ground: Ground, options: Options, progress: Progress) -> tuple[Start, float]:
+    """The start a few iterations on, and its cost there."""
     held = gauges(ground.factors, ground.found, start.values, ground.space)
-    touched = ground.found.touched(start.values)
     trial = replace(options, method="lm", iterations=TRIAL)
-    descent = Descent([*ground.factors, *held], touched, trial, progress)
-    stop = descent.run()
+    descent = Descent([*ground.factors, *held], ground.found.touched(start.values), trial, progress)
+    before, stop = descent.cost, descent.run()
     values = gtsam.Values(start.values)
     values.update(descent.values)
-    return start._replace(values=values, steps=tuple(descent.steps)), descent.cost, stop == NO_FALL
+    settled = stop if stop in (NO_FALL, SETTLED) else ""
+    ahead = replace(start, values=values, cost=before, steps=tuple(descent.steps), settled=settled)
+    return ahead, descent.cost
 
 
 def _wound(ground: Ground, values: gtsam.Values) -> float:
     """The angle (rad) by which the worst edge disagrees with the values."""
-    poses = [
-        ground.space.pose_in(values, key) if is_pose(key) else ground.space.identity for key in ground.keys
-    ]
-    rotations = matrices_of(ground.space, poses)[:, :-1, :-1]
+    rotations = rotations_of(ground.space, values, ground.found)
     return float(turns(ground.edges, rotations).max(initial=0.0))
 
 
 def _stated(ground: Ground) -> gtsam.Values:
-    if not states_all(ground.factors, ground.stated):
+    if not ground.states_all:
         raise BadConfig(
             "initialization 'file': the graph states no vertices, or not all of them; use odometry"
         )
