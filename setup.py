@@ -27,7 +27,8 @@ setup(
         ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),
         (f"share/{NAME}", ["package.xml"]),
         (f"share/{NAME}/launch", files("launch/*.py")),
-        (f"share/{NAME}/config", files("config/*.yaml")),
+        (f"share/{NAME}/config", files("config/*")),
+        (f"lib/{NAME}", ["resource/backend"]),  # where `ros2 run` looks
     ],
     zip_safe=False,
     entry_points={"console_scripts": ["slam-backend = slam_backend.cli:main"]},
