@@ -7,28 +7,37 @@ snapshot over a pipe; there a thread answers, with arrays that are written as th
 import math
 import multiprocessing
 import pickle
+import signal
 import threading
 from collections.abc import Callable
+from contextlib import suppress
 from multiprocessing.connection import Connection
 from queue import SimpleQueue
-from typing import Any
 
 import numpy as np
+import rclpy
+from geometry_msgs.msg import PoseStamped
+from nav_msgs.srv import GetPlan
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.signals import SignalHandlerOptions
 
 from ..core.errors import BadMessage
 from ..core.measurement import SECOND, Array, stamp_of
 from ..core.trajectory import Snapshot, Stamps
 
-MOST = 200_000  # poses in one answer; a receiver in Python needs minutes for more
+MOST = 50_000  # resampled poses in one answer
+PATIENCE = 0.2  # s between two looks at whether to stop
 PAUSE = 1.0  # s before a process that ended is started anew
+FAREWELL = 1.0  # s that the process may take to leave the network
 Newest = Callable[[], Snapshot | None]
 
 
 class Answers:
     """Keeps the process alive and gives it snapshots.
 
-    service: its full name. newest: called in a thread of its own for each request, may take a moment. log: told in
-    words when the process was lost.
+    service: its full name. frame: the frame of the trajectory. newest: called in a thread of its own for each request,
+    may take a moment. log: told in words when the process was lost.
     """
 
     def __init__(
@@ -38,7 +47,8 @@ class Answers:
         self._newest, self._log = newest, log
         self._stop = threading.Event()
         self._start()
-        threading.Thread(target=self._keep, name="answers", daemon=True).start()
+        self._thread = threading.Thread(target=self._keep, name="answers", daemon=True)
+        self._thread.start()
 
     @property
     def pid(self) -> int | None:
@@ -47,8 +57,11 @@ class Answers:
     def close(self) -> None:
         """End the process; safe to call twice."""
         self._stop.set()
-        self._process.terminate()
-        self._process.join()
+        self._thread.join()
+        self._process.join(FAREWELL)
+        if self._process.is_alive():
+            self._process.kill()
+            self._process.join()
 
     def _start(self) -> None:
         context = multiprocessing.get_context("spawn")  # a forked copy of DDS's threads would deadlock
@@ -61,16 +74,18 @@ class Answers:
         """Until told to stop: answer the process, and start another one where it ended."""
         while True:
             try:
-                while True:
-                    self._pipe.recv_bytes()
-                    _send(self._pipe, self._newest())
+                while not self._stop.is_set():
+                    if self._pipe.poll(PATIENCE):
+                        self._pipe.recv_bytes()
+                        _send(self._pipe, self._newest())
             except (EOFError, OSError):
-                self._pipe.close()
+                pass
+            self._pipe.close()  # by which the process knows its end
             if self._stop.wait(PAUSE):
                 return
             self._process.join()
             self._log(
-                f"the process of get_trajectory ended with code {self._process.exitcode}; starting another"
+                f"the process of get_trajectory ended with code {self._process.exitcode}; another one starts"
             )
             self._start()
 
@@ -114,17 +129,46 @@ def selected(snapshot: Snapshot | None, start: int, goal: int, period: float) ->
     return wanted, snapshot.at(wanted)
 
 
-class Plans:
-    """nav_msgs PoseStamped objects, reused from answer to answer: filling one is several times faster than making it."""
+class Server:
+    """Answers requests with what the node's process knows."""
 
-    def __init__(self, frame: str) -> None:
-        self._frame = frame
-        self._pool: list[Any] = []
+    def __init__(self, pipe: Connection, frame: str, warn: Callable[[str], object]) -> None:
+        self._pipe, self._frame, self._warn = pipe, frame, warn
+        self._snapshots: SimpleQueue[Snapshot | None] = SimpleQueue()
+        self._pool: list[PoseStamped] = []
 
-    def fill(self, stamps: Stamps, sevens: Array) -> list[Any]:
-        """A list of the N poses, valid until the next call."""
-        from geometry_msgs.msg import PoseStamped
+    def listen(self) -> None:
+        """Until the node is gone."""
+        try:
+            while True:
+                self._snapshots.put(_receive(self._pipe))
+        except (EOFError, OSError):
+            self._snapshots.put(None)
 
+    def answer(self, request: GetPlan.Request, response: GetPlan.Response) -> GetPlan.Response:
+        response.plan.header.frame_id = self._frame
+        try:
+            stamps, sevens = self._selected(request)
+        except BadMessage as error:
+            self._warn(f"get_trajectory answers nothing: {error}")
+            return response
+        response.plan.poses = self._filled(stamps, sevens)
+        if len(stamps):
+            response.plan.header.stamp = response.plan.poses[-1].header.stamp
+        return response
+
+    def _selected(self, request: GetPlan.Request) -> tuple[Stamps, Array]:
+        frame = request.start.header.frame_id
+        if frame.startswith(f"{self._frame}@"):
+            raise BadMessage(f"'{frame}': what was believed at a stamp cannot be asked yet")
+        if frame not in ("", self._frame):
+            raise BadMessage(f"'{frame}' is not the frame of the trajectory, which is '{self._frame}'")
+        period = float(str(np.float32(request.tolerance)))  # 0.1 as it was meant, not 0.10000000149
+        self._pipe.send_bytes(b"")
+        return selected(self._snapshots.get(), stamp_of(request.start), stamp_of(request.goal), period)
+
+    def _filled(self, stamps: Stamps, sevens: Array) -> list[PoseStamped]:
+        """The poses, in objects that are reused: to fill one is several times faster than to make it."""
         for _ in range(len(stamps) - len(self._pool)):
             new = PoseStamped()
             new.header.frame_id = self._frame
@@ -141,56 +185,22 @@ class Plans:
 
 def serve(pipe: Connection, service: str, namespace: str, frame: str) -> None:
     """The process: answers until the node's end of the pipe is closed."""
-    import signal
-
-    import rclpy
-    from nav_msgs.srv import GetPlan
-    from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
-    from rclpy.node import Node
-    from rclpy.signals import SignalHandlerOptions
-
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the node's affair: the pipe will tell
     context = rclpy.Context()
     rclpy.init(context=context, signal_handler_options=SignalHandlerOptions.NO)
-    # hidden by its underscore; the node's arguments do not reach it: the name of the service is resolved already
-    name = "_" + service.strip("/").replace("/", "_")
-    node = Node(name, namespace=namespace, context=context, use_global_arguments=False, enable_rosout=True,
-                start_parameter_services=False)  # fmt: skip
-    snapshots: SimpleQueue[Snapshot | None] = SimpleQueue()
-    plans = Plans(frame)
+    name = "_" + service.strip("/").replace("/", "_")  # of its own, and hidden by the underscore
+    node = Node(
+        name, namespace=namespace, context=context, use_global_arguments=False, start_parameter_services=False
+    )
+    server = Server(pipe, frame, node.get_logger().warning)
+    node.create_service(GetPlan, service, server.answer)
 
     def listen() -> None:
-        try:
-            while True:
-                snapshots.put(_receive(pipe))
-        except (EOFError, OSError):
-            context.try_shutdown()
+        server.listen()
+        context.try_shutdown()
 
-    def answer(request: Any, response: Any) -> Any:
-        response.plan.header.frame_id = frame
-        try:
-            asked = request.start.header.frame_id
-            if asked not in ("", frame):
-                what = "not possible yet" if asked.startswith(f"{frame}@") else "no frame of a trajectory"
-                raise BadMessage(f"'{asked}' is {what}; there is '{frame}'")
-            pipe.send_bytes(b"")
-            snapshot = snapshots.get()
-            # the shortest decimal that is this float32: 0.1 s, not 0.10000000149
-            period = float(str(np.float32(request.tolerance)))
-            stamps, sevens = selected(snapshot, stamp_of(request.start), stamp_of(request.goal), period)
-        except BadMessage as error:
-            node.get_logger().warning(f"get_trajectory answers nothing: {error}")
-            return response
-        response.plan.poses = plans.fill(stamps, sevens)
-        if len(stamps):
-            response.plan.header.stamp = response.plan.poses[-1].header.stamp
-        return response
-
-    node.create_service(GetPlan, service, answer)
     threading.Thread(target=listen, name="listen", daemon=True).start()
     executor = SingleThreadedExecutor(context=context)
     executor.add_node(node)
-    try:
+    with suppress(ExternalShutdownException):
         executor.spin()
-    except ExternalShutdownException:
-        pass  # the node is gone

@@ -1,0 +1,63 @@
+"""A living run for core.query: the newest snapshot, the newest decisions, covariances from the worker."""
+
+from collections.abc import Mapping
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from ..core.config import Config, OdometrySource
+from ..core.decisions import as_json
+from ..core.errors import SlamError, SolverFailure
+from ..core.graph import Decision
+from ..core.measurement import Array
+from ..core.space import SPACES
+from ..core.trajectory import Snapshot, Stamps, Trajectory
+from ..io.feeder import Feeder
+
+PATIENCE = 5.0  # s that the worker may take to come to a request
+
+
+class Believed:
+    """Implements core.query.Known. feeder: waited for when a covariance is asked; None: no covariance is known."""
+
+    def __init__(
+        self,
+        snapshot: Snapshot,
+        decided: Mapping[str, Decision],
+        config: Config,
+        feeder: Feeder | None = None,
+    ) -> None:
+        self._snapshot, self._decided, self._feeder = snapshot, decided, feeder
+        self.space = SPACES[config.space]
+        driver = config.sources.get(config.driver or "")
+        self.noise = driver if isinstance(driver, OdometrySource) else OdometrySource()
+
+    @property
+    def trajectory(self) -> Trajectory:
+        return self._snapshot.trajectory
+
+    @property
+    def indices(self) -> Stamps:
+        return self._snapshot.indices
+
+    @property
+    def odometry(self) -> Trajectory:
+        return self._snapshot.odometry
+
+    @cached_property
+    def landmarks(self) -> Mapping[str, Array]:
+        return dict(zip(self._snapshot.names, self._snapshot.landmarks, strict=True))
+
+    def covariance(self, index: int) -> Array:
+        """Of a keyframe's pose as the worker believes it now, a little later than the snapshot."""
+        if self._feeder is None:
+            raise SolverFailure("there is no worker to ask for a covariance", ())
+        try:
+            return np.asarray(self._feeder.request("covariance", str(index), PATIENCE))
+        except SlamError as error:
+            raise SolverFailure(str(error), ()) from None
+
+    def decision(self, identifier: str) -> Mapping[str, Any] | None:
+        decision = self._decided.get(identifier)
+        return None if decision is None else as_json(decision)

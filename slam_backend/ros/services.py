@@ -1,0 +1,301 @@
+"""The node's services: short answers from what State holds; long work in threads, awaited.
+
+No callback waits. One that has something to wait for is a coroutine: a thread does the work, the executor goes on with
+other callbacks and takes the answer up when it is there. All share a reentrant group, or the first to wait would keep
+the others out.
+"""
+
+import json
+import threading
+from collections.abc import Awaitable, Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
+from datetime import UTC, datetime
+from inspect import isawaitable
+from itertools import count
+from pathlib import Path
+from time import monotonic, sleep
+from typing import Any, TypeVar
+
+from nav_msgs.srv import LoadMap
+from rcl_interfaces.msg import ParameterType, ParameterValue
+from rcl_interfaces.srv import GetParameters, ListParameters, SetParametersAtomically
+from rclpy.callback_groups import ReentrantCallbackGroup
+from rclpy.exceptions import InvalidHandle
+from rclpy.node import Node
+from rclpy.task import Future
+from std_srvs.srv import SetBool, Trigger
+
+from ..core.config import Config
+from ..core.errors import BadConfig, BadFile, SlamError
+from ..core.measurement import Array, format_stamp
+from ..core.query import answers
+from ..core.trajectory import Snapshot
+from ..io.feeder import Feeder
+from .answers import Answers
+from .believed import Believed
+from .state import State
+
+RUNS = "runs"  # the folder of saved runs, under data_dir
+SAVING = 120.0  # s that the worker may take to come to a request to save, and to do it
+FRESH = 0.2  # s that an answer may wait for a newer snapshot
+LOOK = 0.003  # s between two looks for it
+REVISION = "revision"  # as a name in a query: of the snapshot that answered
+T = TypeVar("T")
+Value = Array | Mapping[str, Any] | int | None
+Content = Mapping[str, Any]
+NOT_YET = "not available yet"
+
+
+class Services:
+    """feeder_of: the present feeder, None without a session. refresh: asks for a newer snapshot without waiting for it.
+    reset: begins a new session; called in a thread of its own.
+    """
+
+    def __init__(
+        self,
+        node: Node,
+        state: State,
+        feeder_of: Callable[[], Feeder | None],
+        refresh: Callable[[], None],
+        data_dir: Path,
+        config: Config,
+        reset: Callable[[], None],
+    ) -> None:
+        self._node, self._state, self._data_dir, self._config = node, state, data_dir, config
+        self._feeder_of, self._refresh, self._reset = feeder_of, refresh, reset
+        self._closed = False
+        self._resetting = threading.Lock()
+        group = ReentrantCallbackGroup()
+        table: dict[str, tuple[Any, Any]] = {
+            "query": (GetParameters, self._query),
+            "list": (ListParameters, self._list),
+            "edit": (SetParametersAtomically, self._edit),
+            "load": (LoadMap, self._load),
+            "pause": (SetBool, self._pause),
+            "save": (Trigger, _told(self._save)),
+            "reset": (Trigger, _told(self._begin_anew)),
+        } | {name: (Trigger, _told(_not_yet)) for name in ("optimize", "undo", "redo")}
+        self._services = [
+            node.create_service(type_, f"~/{name}", self._survived(callback), callback_group=group)
+            for name, (type_, callback) in table.items()
+        ]
+        self._answers = Answers(
+            node.resolve_service_name("~/get_trajectory"), node.get_namespace(), config.map_frame, self.newest,
+            node.get_logger().error,
+        )  # fmt: skip
+
+    def close(self) -> None:
+        """Answer no more; safe to call twice."""
+        self._closed = True
+        for service in self._services:
+            self._node.destroy_service(service)
+        self._services = []
+        self._answers.close()
+
+    def newest(self) -> Snapshot | None:
+        """The newest snapshot; when keyframes have been added since, one with them if it comes within FRESH s. Waits."""
+        held, update, until = self._state.snapshot, self._state.update, monotonic() + FRESH
+        if update is None or (held is not None and len(held.indices) > update.keyframe.index):
+            return held
+        self._refresh()
+        while self._state.snapshot is held and monotonic() < until:
+            sleep(LOOK)
+        return self._state.snapshot
+
+    # -- what is known ---------------------------------------------------------------------------
+
+    async def _query(self, request: GetParameters.Request, response: GetParameters.Response) -> Any:
+        """At once if all is known; else with the help of the worker: covariances, and a newer snapshot if one is to come."""
+        found = self._known(request.names, self._state.snapshot, None)
+        if any(value is None for value in found.values()):
+            with suppress(SlamError):  # then it stays unknown
+                found = await self._elsewhere(
+                    lambda: self._known(request.names, self.newest(), self._feeder_of())
+                )
+        response.values = [_parameter(found[name]) for name in request.names]
+        return response
+
+    def _known(
+        self, names: Sequence[str], snapshot: Snapshot | None, feeder: Feeder | None
+    ) -> dict[str, Value]:
+        """Name -> answer, None where there is none. Without a feeder nothing waits."""
+        found: dict[str, Value] = dict.fromkeys(names)
+        if snapshot is None:
+            return found
+        known = Believed(snapshot, self._state.decided, self._config, feeder)
+        for name in found:
+            with suppress(BadConfig):  # no name that could be known
+                found[name] = snapshot.revision if name == REVISION else answers([name], known)[0].value
+        return found
+
+    def _list(self, request: ListParameters.Request, response: ListParameters.Response) -> Any:
+        """Without prefixes the groups; with `group`, or `group/beginning`, the names that can be queried."""
+        groups = self._groups()
+        if not request.prefixes:
+            response.result.prefixes = sorted(groups)
+        for prefix in request.prefixes:
+            group, _, beginning = prefix.partition("/")
+            if group in groups:
+                head, ids = groups[group]()
+                response.result.names += [head + id_ for id_ in ids if id_.startswith(beginning)]
+        return response
+
+    def _groups(self) -> dict[str, Callable[[], tuple[str, list[str]]]]:
+        """Group -> what the name of a member begins with, and how it goes on."""
+        snapshot = self._state.snapshot
+        decided = list(self._state.decided.values())  # in one step: another thread adds to it
+        return {
+            "decisions": lambda: ("decision/", [d.id for d in decided]),
+            "keyframes": lambda: (
+                "pose@",
+                [format_stamp(stamp) for stamp in snapshot.stamps.tolist()] if snapshot else [],
+            ),
+            "landmarks": lambda: ("landmark/", list(snapshot.names) if snapshot else []),
+            "loops": lambda: ("decision/", [d.id for d in decided if d.ends is not None]),
+            "revisions": lambda: ("", [REVISION] if snapshot else []),
+        }
+
+    # -- what is to be done ----------------------------------------------------------------------
+
+    async def _save(self) -> Content:
+        """A run directory: written aside, so that one with its name is whole."""
+        feeder = self._feeder_of()
+        if feeder is None or self._state.update is None:
+            raise SlamError(
+                "there is nothing to save yet: no message of the driving source has been accepted"
+            )
+        asked = feeder.request
+        return await self._elsewhere(lambda: self._saved(asked))
+
+    def _saved(self, ask: Callable[..., Any]) -> Content:
+        stamp = datetime.now(UTC).strftime("%Y-%m-%dT%H-%M-%SZ")
+        runs = self._data_dir / RUNS
+        try:
+            runs.mkdir(parents=True, exist_ok=True)
+            run = next(run for run in _names(runs / stamp) if not run.exists() and _made(_aside(run)))
+            summary = ask("save", str(_aside(run)), SAVING)
+            _aside(run).rename(run)
+        except OSError as error:
+            raise BadFile(f"{runs}: the run cannot be saved: {error}") from None
+        counts = {name: summary["counts"][name] for name in ("keyframes", "landmarks", "factors")}
+        return {"run": str(run), "run_hash": summary["run_hash"], **counts}
+
+    async def _begin_anew(self) -> Content:
+        if not self._resetting.acquire(blocking=False):
+            raise SlamError("a reset is under way already")
+        try:
+            await self._elsewhere(self._reset)
+        finally:
+            self._resetting.release()
+        return {"session": "new"}
+
+    def _pause(self, request: SetBool.Request, response: SetBool.Response) -> Any:
+        feeder = self._feeder_of()
+        if feeder is None:
+            response.message = json.dumps({"error": "there is no session: no source has been heard yet"})
+            return response
+        feeder.pause(request.data)
+        response.success = True
+        response.message = json.dumps({"paused": request.data, "backlog": feeder.backlog})
+        return response
+
+    def _edit(self, _: Any, response: SetParametersAtomically.Response) -> Any:
+        response.result.successful = False
+        response.result.reason = json.dumps({"error": NOT_YET})
+        return response
+
+    def _load(self, request: LoadMap.Request, response: LoadMap.Response) -> Any:
+        self._node.get_logger().warning(f"load of '{request.map_url}' refused: {NOT_YET}")
+        response.result = LoadMap.Response.RESULT_UNDEFINED_FAILURE
+        return response
+
+    def _survived(self, callback: Callable[[Any, Any], Any]) -> Callable[[Any, Any], Awaitable[Any]]:
+        """The callback; where it fails, the response as it was made: what leaves a callback ends the node."""
+
+        async def survived(request: Any, response: Any) -> Any:
+            try:
+                answer = callback(request, response)
+                return await answer if isawaitable(answer) else answer
+            except Exception as error:  # noqa: BLE001  # whatever it is
+                self._node.get_logger().error(f"a service failed: {type(error).__name__}: {error}")
+                return response
+
+        return survived
+
+    async def _elsewhere(self, work: Callable[[], T]) -> T:
+        """The outcome of work done in a thread of its own. SlamError where it raises anything."""
+        executor = self._node.executor
+        outcome: list[T] = []
+        done = Future(executor=executor)
+
+        def run() -> None:
+            failure: SlamError | None = None
+            try:
+                outcome.append(work())
+            except SlamError as error:
+                failure = error
+            except Exception as error:  # noqa: BLE001  # out of a callback it would end the node
+                failure = SlamError(f"failed: {type(error).__name__}: {error}")
+            done.set_result(failure)
+            with suppress(InvalidHandle):  # the executor may be gone
+                executor.wake()
+
+        threading.Thread(target=run, name="service", daemon=True).start()
+        failure = await done
+        if self._closed:
+            await Future()  # for ever: the service is gone, and nobody can be answered
+        if failure is not None:
+            raise failure
+        return outcome[0]
+
+
+def _told(
+    act: Callable[[], Awaitable[Content]],
+) -> Callable[[Any, Trigger.Response], Awaitable[Trigger.Response]]:
+    """A Trigger's callback: the outcome as JSON."""
+
+    async def callback(_: Any, response: Trigger.Response) -> Trigger.Response:
+        try:
+            response.message, response.success = json.dumps(await act()), True
+        except SlamError as error:
+            response.message = json.dumps({"error": str(error)})
+        return response
+
+    return callback
+
+
+async def _not_yet() -> Content:
+    raise SlamError(NOT_YET)
+
+
+def _names(path: Path) -> Iterator[Path]:
+    """path, path-2, path-3, ..."""
+    yield path
+    yield from (path.with_name(f"{path.name}-{n}") for n in count(2))
+
+
+def _aside(run: Path) -> Path:
+    """Where it is written: a run under its own name is whole."""
+    return run.with_name(f".{run.name}")
+
+
+def _made(folder: Path) -> bool:
+    """Whether the folder is new: of two that save at once each gets its own."""
+    try:
+        folder.mkdir()
+    except FileExistsError:
+        return False
+    return True
+
+
+def _parameter(value: Value) -> ParameterValue:
+    """NOT_SET for what is unknown."""
+    if value is None:
+        return ParameterValue()
+    if isinstance(value, int):
+        return ParameterValue(type=ParameterType.PARAMETER_INTEGER, integer_value=value)
+    if isinstance(value, Mapping):
+        return ParameterValue(type=ParameterType.PARAMETER_STRING, string_value=json.dumps(value))
+    return ParameterValue(
+        type=ParameterType.PARAMETER_DOUBLE_ARRAY, double_array_value=value.ravel().tolist()
+    )
