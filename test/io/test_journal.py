@@ -1,0 +1,202 @@
+"""The journal: everything that was heard, in order, readable by anybody, whatever happens to the disk."""
+
+import sqlite3
+import subprocess
+import sys
+import threading
+import time
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from slam_backend.core.errors import BadFile
+from slam_backend.io import journal as module
+from slam_backend.io.bags import open_bag
+from slam_backend.io.encode import encode_odometry
+from slam_backend.io.journal import Journal, JournalReader
+
+ODOMETRY = "nav_msgs/msg/Odometry"
+
+
+def message(n):
+    zeros = np.zeros(36)
+    return encode_odometry(n + 1, "odom", "base", (n, 0, 0, 0, 0, 0, 1), zeros, np.zeros(6), zeros)
+
+
+def until(condition, seconds=5.0):
+    end = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < end, "it did not happen in time"
+        time.sleep(0.01)
+
+
+def rows(path):
+    reader = JournalReader(path)
+    found = reader.after(0, 1_000_000)
+    reader.close()
+    return found
+
+
+@pytest.fixture
+def complaints():
+    return []
+
+
+@pytest.fixture
+def journal(tmp_path, complaints):
+    journal = Journal(tmp_path, complaints.append)
+    yield journal
+    journal.close()
+    assert not [thread for thread in threading.enumerate() if thread.name == "journal"]
+
+
+def test_rows_can_be_read_while_others_are_written(journal) -> None:
+    """In batches of any size, each row once, in order of arrival."""
+    reader, seen = JournalReader(journal.path), []
+    for n in range(300):
+        journal.append("/odom", ODOMETRY, message(n))
+        if n % 50 == 0:
+            assert journal.wait(len(seen), 5)
+            seen += reader.after(len(seen), 7)
+    until(lambda: journal.committed == 300)
+    while len(seen) < 300:
+        seen += reader.after(len(seen), 100)
+    reader.close()
+    assert [row.id for row in seen] == list(range(1, 301))
+    assert [row.record.data for row in seen] == [message(n) for n in range(300)]
+
+
+def test_log_times_increase_strictly_though_the_clock_stands_or_goes_back(journal, monkeypatch) -> None:
+    """Readers order by them."""
+    times = iter([5, 5, 5, 3, 10, 9])
+    monkeypatch.setattr(module, "time_ns", lambda: next(times))
+    for n in range(6):
+        journal.append("/odom", ODOMETRY, message(n))
+    until(lambda: journal.committed == 6)
+    assert [row.record.log_time for row in rows(journal.path)] == [5, 6, 7, 8, 10, 11]
+
+
+def test_many_threads_append_and_nothing_is_lost(journal) -> None:
+    def append(topic):
+        for n in range(500):
+            journal.append(topic, ODOMETRY, message(n))
+
+    threads = [threading.Thread(target=append, args=(f"/odom{k}",)) for k in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    until(lambda: journal.committed == 2000)
+    found = rows(journal.path)
+    assert all(a.record.log_time < b.record.log_time for a, b in pairwise(found))
+    for k in range(4):
+        assert [r.record.data for r in found if r.record.topic == f"/odom{k}"] == [
+            message(n) for n in range(500)
+        ]
+
+
+def test_it_is_an_ordinary_bag_of_one_file(journal) -> None:
+    """Closed, nothing but the one file is needed to read it, definitions included."""
+    for n in range(10):
+        journal.append("/odom", ODOMETRY, message(n))
+    journal.close()
+    assert not journal.path.with_name("journal.db3-wal").exists()
+    with open_bag(journal.path) as bag:
+        assert [(r.topic, r.type, bytes(r.data)) for r in bag.records()] == [
+            ("/odom", ODOMETRY, message(n)) for n in range(10)
+        ]
+    (text,) = sqlite3.connect(journal.path).execute(
+        "SELECT encoded_message_definition FROM message_definitions"
+    )
+    assert "geometry_msgs/PoseWithCovariance pose" in text[0]
+
+
+def test_opened_again_it_goes_on(journal, tmp_path, complaints) -> None:
+    """Ids and log times continue, topics keep their rows."""
+    journal.append("/odom", ODOMETRY, message(0))
+    journal.close()
+    again = Journal(tmp_path, complaints.append)
+    assert again.committed == 1
+    again.append("/odom", ODOMETRY, message(1))
+    again.append("/odometry", ODOMETRY, message(2))
+    again.close()
+    found = rows(journal.path)
+    assert [(row.id, row.record.topic) for row in found] == [(1, "/odom"), (2, "/odom"), (3, "/odometry")]
+    assert all(a.record.log_time < b.record.log_time for a, b in pairwise(found))
+
+
+def test_what_was_committed_survives_sigkill(tmp_path) -> None:
+    code = (
+        "import os, sys\nfrom pathlib import Path\nfrom slam_backend.io.journal import Journal\n"
+        "journal = Journal(Path(sys.argv[1]), print)\n"
+        "for n in range(1000): journal.append('/odom', 'nav_msgs/msg/Odometry', b'%d' % n)\n"
+        "journal.wait(999, 10)\nos.kill(os.getpid(), 9)"
+    )
+    ended = subprocess.run([sys.executable, "-c", code, str(tmp_path)], timeout=60, check=False)
+    assert ended.returncode == -9
+    assert [row.record.data for row in rows(tmp_path / "journal.db3")] == [b"%d" % n for n in range(1000)]
+
+
+def test_a_full_disk_is_said_once_and_waited_out(journal, complaints, monkeypatch) -> None:
+    """Records wait in memory, those of a topic that was new among them; when there is room again, nothing is lost."""
+    monkeypatch.setattr(module, "RETRY", 0.05)
+    journal.append("/odom", ODOMETRY, message(0))
+    until(lambda: journal.committed == 1)
+    journal._database.execute("PRAGMA max_page_count=1")
+    for n in range(1, 200):
+        journal.append("/new" if n % 2 else "/odom", ODOMETRY, message(n))
+    until(lambda: complaints)
+    time.sleep(0.3)
+    (line,) = complaints
+    assert str(journal.path) in line
+    assert "disk is full" in line
+    assert "\n" not in line
+    assert journal.waiting == 199
+    journal._database.execute("PRAGMA max_page_count=1000000")
+    until(lambda: journal.committed == 200)
+    assert [row.record.data for row in rows(journal.path)] == [message(n) for n in range(200)]
+    journal._database.execute("PRAGMA max_page_count=1")
+    for n in range(200):
+        journal.append("/odom", ODOMETRY, message(n))
+    until(lambda: len(complaints) == 2)
+
+
+def test_memory_is_bounded_and_what_is_lost_is_counted(journal, complaints, monkeypatch) -> None:
+    monkeypatch.setattr(module, "RETRY", 0.05)
+    monkeypatch.setattr(module, "LIMIT", 50)
+    journal._database.execute("PRAGMA max_page_count=1")
+    for n in range(60):
+        journal.append("/odom", ODOMETRY, message(n) * 10)
+    until(lambda: complaints)
+    assert (journal.waiting, journal.lost) == (50, 10)
+    journal.close()
+    assert "its last 50 records could not be written" in complaints[-1]
+
+
+@pytest.mark.parametrize("what", ["a file", "in a file", "no database"])
+def test_a_folder_that_cannot_be_used_is_one_line(tmp_path, what) -> None:
+    (tmp_path / "file").write_text("something else")
+    folder = {
+        "a file": tmp_path / "file",
+        "in a file": tmp_path / "file" / "folder",
+        "no database": tmp_path / "folder",
+    }[what]
+    if what == "no database":
+        folder.mkdir()
+        (folder / "journal.db3").write_text("something else, long enough to be looked at " * 100)
+    with pytest.raises(BadFile, match=r"cannot be used as journal: [^\n]+$") as told:
+        Journal(folder, print)
+    assert "\n" not in str(told.value)
+
+
+def test_waiting_ends_with_a_row_a_nudge_or_the_time(journal) -> None:
+    begin = time.monotonic()
+    assert not journal.wait(0, 0.1)
+    assert time.monotonic() - begin < 1
+    asked = []
+    threading.Timer(0.1, lambda: (asked.append(1), journal.nudge())).start()
+    assert journal.wait(0, 5, lambda: bool(asked))
+    threading.Timer(0.1, lambda: journal.append("/odom", ODOMETRY, message(0))).start()
+    assert journal.wait(0, 5)
+    assert time.monotonic() - begin < 4
