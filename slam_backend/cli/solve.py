@@ -87,7 +87,7 @@ def _said(problem: "Problem", found: "Optimum") -> dict[str, Any]:
         "vertices": len(problem.graph.ids),
         "edges": len(problem.graph.edges),
         "cost_initial": found.cost_initial,
-        "cost_start": found.start.cost,
+        "cost_start": found.cost_start,
         "cost": solution.cost,
         "iterations": updates if found.start.name == "isam2" else len(found.steps),
         "seconds": round(found.seconds, 4),

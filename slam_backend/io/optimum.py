@@ -10,10 +10,10 @@ from typing import Literal
 
 from ..core.config import KernelName
 from ..core.graph import Factor
-from ..core.solvers.batch import Solution, polish, solve
+from ..core.solvers.batch import Solution, Start, polish, solve
 from ..core.solvers.descent import MethodName, Options, Step
 from ..core.solvers.gnc import solve_gnc
-from ..core.solvers.initialize import InitializationName, Start, cost_of, initialize, states_all
+from ..core.solvers.initialize import InitializationName, cost_of, initialize
 from .online import solve_online
 from .problem import Problem
 
@@ -39,12 +39,13 @@ class Request:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Optimum:
-    """start: with its cost and why it was chosen. steps: each with the seconds it took; seconds: of all of them and of
+    """start: with why it was chosen, and its cost. steps: each with the seconds it took; seconds: of all of them and of
     the initialization. refused: the loops that GNC took out; the costs of the solution are those of what it kept.
     cost_initial: of the file's vertices, or of the odometry where it states none.
     """
 
     start: Start
+    cost_start: float
     cost_initial: float
     solution: Solution
     steps: tuple[tuple[Step, float], ...]
@@ -59,7 +60,7 @@ def optimum(problem: Problem, request: Request, advance: Advance) -> Optimum:
     refused: tuple[str, ...] = ()
     if request.method == "isam2":
         online, relinearized = solve_online(problem, request.kernel, advance)
-        start = Start(online, "isam2", cost_of(factors, online), why="iSAM2's last estimate")
+        start = Start(online, "isam2", "iSAM2's last estimate", cost_of(factors, online))
         nothing = replace(options, iterations=0, polish=False)
         solution = replace(solve(factors, relinearized, nothing), stop="every vertex is in")
         if request.polish:
@@ -69,19 +70,19 @@ def optimum(problem: Problem, request: Request, advance: Advance) -> Optimum:
         init = "odometry" if request.gnc and request.init == "auto" else request.init
         start = initialize(factors, problem.stated, init, options, watch)
         if request.gnc:
-            solution, refused = solve_gnc(factors, start.values, options, watch)
+            solution, refused = solve_gnc(factors, start, options, watch)
         else:
-            solution = solve(factors, start.values, options, watch)
+            solution = solve(factors, start, options, watch)
     seconds, gone = watch.elapsed, set(refused)
     removed = tuple(factor for factor in factors if factor.id in gone)
-    return Optimum(start, initial_cost(problem, start), solution, tuple(watch.steps), seconds, removed)
+    before = solution.cost_initial if start.cost is None else start.cost
+    return Optimum(start, before, _untouched(problem), solution, tuple(watch.steps), seconds, removed)
 
 
-def initial_cost(problem: Problem, start: Start) -> float:
-    """Of the file's vertices, or of the odometry where the file states none: before anything was done."""
-    stated = states_all(problem.factors, problem.stated)
-    before: InitializationName = "file" if stated else "odometry"
-    return start.cost if start.name == before else initialize(problem.factors, problem.stated, before).cost
+def _untouched(problem: Problem) -> float:
+    """Cost of the file's vertices, or of the odometry where the file states none."""
+    before: InitializationName = "odometry" if problem.graph.states is None else "file"
+    return cost_of(problem.factors, initialize(problem.factors, problem.stated, before).values)
 
 
 class Watch:

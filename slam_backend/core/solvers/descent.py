@@ -27,6 +27,7 @@ BOUND, SINGULAR, RISES = "lambda at its bound", "singular system", "cost rises"
 DAMPED = 1e-4  # lambda above which a short step may have been the damping's wish
 FAST = 0.1  # of the last fall of the cost: Newton's convergence, where the falls that follow sum to less than 1.2 of the next
 REST = 10.0  # times `relative`: what may be left to fall then
+UNDAMPED = 1e-8  # lambda that is nothing beside any information, and with which Levenberg-Marquardt begins
 ZERO = 1e-8  # a cost below which every edge is met
 PATIENCE = 5  # iterations without a better cost after which Gauss-Newton is given up
 SHRINKS = 0.7  # of the last step: near the optimum, steps that shrink less than that are only rounding
@@ -159,7 +160,7 @@ class Descent:
 
     def _at_end(self, last: float, fell: float, cost: float) -> bool:
         """Whether the cost falls so much faster each time that what is left, by the last two, need not be waited for."""
-        quick = 0 < fell < FAST * last and self.steps[-1].damping <= DAMPED
+        quick = 0 < fell < FAST * last and self.steps[-1].damping <= UNDAMPED
         return quick and fell * fell / last <= REST * self._options.relative * cost
 
     def _settle(self) -> str:
@@ -203,6 +204,8 @@ class Descent:
         params = row.params()
         params.setOrderingType(self._options.ordering.upper())
         params.setLinearSolverType("MULTIFRONTAL_QR" if self._qr else "MULTIFRONTAL_CHOLESKY")
+        if method == "lm":
+            params.setlambdaInitial(UNDAMPED)  # gtsam's 1e-5 is a brake where the information is as small
         optimizer = row.optimizer(self._graph, self.values, params)
 
         def advance() -> tuple[gtsam.Values, float, float]:
