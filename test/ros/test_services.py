@@ -155,6 +155,7 @@ class Client:
         if name not in self.clients:
             self.clients[name] = self.node.create_client(type_, f"/{self.records}/slam_backend/{name}")
             assert self.clients[name].wait_for_service(20), f"there is no service {name}"
+            time.sleep(0.3)  # the service may not see its client yet, and would answer into the void
         return self.clients[name].call_async(request)
 
     def end(self, future: Any, seconds: float = 30) -> Any:
