@@ -1,6 +1,7 @@
 """The package says the same thing everywhere, and what pip installs runs."""
 
 import ast
+import os
 import re
 import subprocess
 import sys
@@ -96,6 +97,7 @@ def test_pip_installs_script_and_ament_files(tmp_path: Path) -> None:
     assert (prefix / "bin" / "slam-backend").exists()
     assert (prefix / "share/ament_index/resource_index/packages/slam_backend").exists()
     assert (prefix / "share/slam_backend/package.xml").exists()
+    assert os.access(prefix / "lib/slam_backend/backend", os.X_OK)  # where `ros2 run` looks
     assert next(prefix.rglob("slam_backend/py.typed"))
 
 
