@@ -3,6 +3,7 @@
 import ast
 import os
 import re
+import shutil
 import subprocess
 import sys
 import xml.etree.ElementTree as ET
@@ -110,5 +111,5 @@ def copied(tmp_path: Path) -> Path:
         target = tmp_path / "source" / name
         target.parent.mkdir(parents=True, exist_ok=True)
         if (ROOT / name).exists():
-            target.write_bytes((ROOT / name).read_bytes())
+            shutil.copy(ROOT / name, target)  # with its mode
     return tmp_path / "source"
