@@ -6,13 +6,21 @@ from typing import Any
 
 from ..core.config import Config, config_from
 from ..core.errors import BadConfig, BadMessage
+from ..core.measurement import Array
 from ..core.sensors.cloud import columns
 from ..core.sensors.odometry import DECODERS as ODOMETRY
+from ..core.sensors.odometry import TRANSFORMS, OdometryPose, decode_transforms
 from .bags import Bag
-from .inputs import EDGES, LANDMARKS, BagInputs, GraphInput
+from .inputs import EDGES, LANDMARKS, TF_STATIC, BagInputs, GraphInput
 from .records import Record
 
-ENOUGH = 200  # odometry messages that are looked at to tell whether the robot moves in a plane
+ENOUGH = (
+    200  # messages that are looked at to tell whether the robot moves in a plane, or /tf holds its odometry
+)
+RANK = {
+    "nav_msgs/msg/Odometry": 2,
+    TRANSFORMS: 1,
+}  # of the types of odometry: others may be poses of anything
 TRUTH = (
     "truth",
     "ground",
@@ -75,7 +83,7 @@ def _kinds_of(inputs: BagInputs) -> tuple[dict[str, str], list[str]]:
     odometries = [topic for topic, kind in kinds.items() if kind == "odometry"]
     best = max(
         odometries,
-        key=lambda topic: (inputs.topics[topic].type == "nav_msgs/msg/Odometry", inputs.topics[topic].count),
+        key=lambda topic: (RANK.get(inputs.topics[topic].type, 0), inputs.topics[topic].count),
         default=None,
     )
     for topic in odometries:
@@ -91,9 +99,11 @@ def _first_messages(inputs: BagInputs) -> dict[str, tuple[Any, Bag]]:
     types = {*ODOMETRY, "sensor_msgs/msg/PointCloud2"}
     for bag in inputs.bags:
         for topic, what in bag.topics.items():
-            if what.type in types and topic not in first:
-                for record in islice(bag.records({topic}), 1):
+            if what.type in types and topic not in first and topic != TF_STATIC:
+                for record in islice(bag.records({topic}), ENOUGH if what.type == TRANSFORMS else 1):
                     first[topic] = (record, bag)
+                    if kind_of(record, bag.typestore) is not None:
+                        break
     return first
 
 
@@ -101,6 +111,8 @@ def kind_of(record: Record, typestore: Any) -> str | None:
     """What a topic is, from its first message; None when it is nothing that can be used."""
     try:
         message: Any = typestore.deserialize_cdr(record.data, record.type)
+        if record.type == TRANSFORMS:
+            return "odometry" if any(decode_transforms(message, "")) else None
     except Exception:  # noqa: BLE001  # any damage: the decoder will say it, message by message
         return None
     if record.type == "sensor_msgs/msg/PointCloud2":
@@ -127,12 +139,11 @@ def _planar(inputs: BagInputs, kinds: dict[str, str]) -> bool:
         t for t, k in kinds.items() if k == "relative"
     )
     poses = list(islice(_poses(inputs, driving), ENOUGH))
-    return bool(poses) and all(
-        p.position.z == 0 and p.orientation.x == 0 and p.orientation.y == 0 for p in poses
-    )
+    return bool(poses) and all(z == 0 and qx == 0 and qy == 0 for _, _, z, qx, qy, *_ in poses)
 
 
-def _poses(inputs: BagInputs, topic: str) -> Iterator[Any]:
+def _poses(inputs: BagInputs, topic: str) -> Iterator[Array]:
+    """Sevens, as the messages have them."""
     for bag in inputs.bags:
         records: Iterable[Any] = bag.records({topic}) if topic in bag.topics else ()
         for record in records:
@@ -142,4 +153,7 @@ def _poses(inputs: BagInputs, topic: str) -> Iterator[Any]:
                 message: Any = bag.typestore.deserialize_cdr(record.data, record.type)
             except Exception:  # noqa: BLE001, S112  # as above
                 continue
-            yield getattr(message.pose, "pose", message.pose)
+            told = ODOMETRY[record.type](message, "")
+            for pose in [told] if isinstance(told, OdometryPose) else told:
+                assert isinstance(pose, OdometryPose)
+                yield pose.pose

@@ -7,11 +7,17 @@ from slam_backend.core.errors import BadConfig
 from slam_backend.core.measurement import SECOND
 from slam_backend.io.bags import write_bag
 from slam_backend.io.discover import discover
-from slam_backend.io.encode import encode_cloud, encode_odometry, encode_pose_with_covariance
+from slam_backend.io.encode import (
+    encode_cloud,
+    encode_odometry,
+    encode_pose_with_covariance,
+    encode_transforms,
+)
 from slam_backend.io.inputs import open_inputs
 from slam_backend.io.records import Record
 
 ODOMETRY, CLOUD = "nav_msgs/msg/Odometry", "sensor_msgs/msg/PointCloud2"
+TRANSFORMS = "tf2_msgs/msg/TFMessage"
 COVARIANCE = "geometry_msgs/msg/PoseWithCovarianceStamped"
 ZERO = np.zeros(36), np.zeros(6), np.zeros(36)
 
@@ -29,6 +35,15 @@ def pose(n, topic, frame):
 def cloud(n, topic, *names):
     return Record(
         topic, CLOUD, n, encode_cloud((n + 1) * SECOND, "base", {name: np.ones(2) for name in names})
+    )
+
+
+def transforms(n, parent, child, topic="/tf"):
+    return Record(
+        topic,
+        TRANSFORMS,
+        n,
+        encode_transforms((n + 1) * SECOND, parent, {child: np.array([n, 0, 0, 0, 0, 0, 1.0])}),
     )
 
 
@@ -92,3 +107,21 @@ def test_a_bag_that_nothing_can_drive_is_said_with_its_topics(found):
 def test_relative_poses_alone_drive(found):
     config, _ = found(odometry(2, "/steps", ("base@1.000000000", "base@2.000000000")))
     assert config.driver == "steps"
+
+
+def test_without_an_odometry_topic_the_pair_odom_to_base_on_tf_serves(found):
+    """Though /tf begins with other pairs, and poses of who knows what are there too; not what is static."""
+    config, notes = found(
+        *(transforms(n, "base", "wheel") for n in range(10)), *(transforms(n, "odom", "base") for n in range(10, 20)),
+        *(transforms(n, "odom", "anchor", "/tf_static") for n in range(30)), *(pose(n, "/goal", "odom") for n in range(40)),
+    )  # fmt: skip
+    assert {name: (s.kind, s.topic) for name, s in config.sources.items()} == {"tf": ("odometry", "/tf")}
+    assert config.space == "2d"
+    config, notes = found(*(transforms(n, "odom", "base") for n in range(9)), odometry(3))
+    assert list(config.sources) == ["odom"]
+    assert any("/tf is left aside: /odom is the odometry" in note for note in notes)
+
+
+def test_transforms_of_other_pairs_are_no_odometry(found):
+    with pytest.raises(BadConfig, match="no odometry and no relative poses"):
+        found(*(transforms(n, "map", "odom") for n in range(9)))

@@ -1,6 +1,6 @@
 """Wheel, visual or lidar odometry: the pose of the base in a drifting frame."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -27,6 +27,7 @@ class OdometryPose(Measurement):
 
 
 STILL = frozen(np.zeros(6))
+PARENT = "odom"  # REP 105's name of the drifting frame, in whatever namespace
 
 
 def decode_odometry(message: Message, source: str) -> OdometryPose:
@@ -66,10 +67,22 @@ def decode_pose(message: Message, source: str) -> OdometryPose:
     )
 
 
+def decode_transforms(message: Message, source: str) -> Iterable[OdometryPose]:
+    """tf2_msgs/msg/TFMessage: the pairs odom -> base among its transforms, for robots that publish no odometry else."""
+    for each in message.transforms:
+        if each.header.frame_id.rpartition("/")[2] == PARENT:
+            p, q = each.transform.translation, each.transform.rotation
+            seven = frozen((p.x, p.y, p.z, q.x, q.y, q.z, q.w))
+            frames = each.header.frame_id, each.child_frame_id
+            yield OdometryPose(stamp_of(each), source, *frames, seven, UNKNOWN, STILL, UNKNOWN)
+
+
+TRANSFORMS = "tf2_msgs/msg/TFMessage"
 DECODERS: Mapping[str, Decoder] = {
     "nav_msgs/msg/Odometry": decode_odometry,
     "geometry_msgs/msg/PoseWithCovarianceStamped": decode_pose_with_covariance,
     "geometry_msgs/msg/PoseStamped": decode_pose,
+    TRANSFORMS: decode_transforms,
 }
 
 

@@ -14,6 +14,7 @@ from slam_backend.core.sensors.odometry import (
     decode_odometry,
     decode_pose,
     decode_pose_with_covariance,
+    decode_transforms,
     factors,
 )
 
@@ -57,6 +58,34 @@ def test_what_a_plain_pose_does_not_say_is_unknown(decode):
     assert told.covariance.any() == (decode is decode_pose_with_covariance)
     assert not told.twist.any()
     assert not told.twist_covariance.any()
+
+
+def transform(parent, child, seconds):
+    stamp = SimpleNamespace(sec=seconds, nanosec=0)
+    turn = SimpleNamespace(x=0.0, y=0.0, z=0.6, w=0.8)
+    return SimpleNamespace(
+        header=SimpleNamespace(stamp=stamp, frame_id=parent), child_frame_id=child,
+        transform=SimpleNamespace(translation=SimpleNamespace(x=1.0, y=2.0, z=3.0), rotation=turn),
+    )  # fmt: skip
+
+
+def test_of_transforms_the_pair_odom_to_base_is_the_odometry():
+    """In whatever namespace; a frame that only sounds like it is another."""
+    pairs = [
+        ("map", "odom"),
+        ("odom", "base_link"),
+        ("base_link", "odom"),
+        ("/r1/odom", "r1/base"),
+        ("wheel_odom", "b"),
+    ]
+    message = SimpleNamespace(transforms=[transform(*pair, n) for n, pair in enumerate(pairs)])
+    told = list(decode_transforms(message, "tf"))
+    assert [(t.stamp, t.source, t.frame, t.child) for t in told] == [
+        (1 * SECOND, "tf", "odom", "base_link"),
+        (3 * SECOND, "tf", "/r1/odom", "r1/base"),
+    ]
+    np.testing.assert_array_equal(told[0].pose, [1, 2, 3, 0, 0, 0.6, 0.8])
+    assert not told[0].covariance.any()
 
 
 @pytest.mark.parametrize("name", messages())
