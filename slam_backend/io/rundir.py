@@ -30,8 +30,9 @@ FILES = ("summary.json", "config.yaml", "trajectory.tum", "odometry.tum", "onlin
          "decisions.jsonl", "graph.g2o", "linearized.npz")  # fmt: skip
 
 
-def write_run(result: Result, out: Path) -> None:
+def write_run(result: Result, out: Path | str) -> None:
     """Write the files of one run. An earlier run in the same directory is replaced; BadFile for anything else there."""
+    out = Path(out)
     prepare(out)
     snapshot = result.snapshot
     for name, trajectory in (
