@@ -6,7 +6,7 @@ from typing import Any
 
 from ..core.config import Config, config_from
 from ..core.errors import BadConfig, BadMessage
-from ..core.measurement import Array
+from ..core.measurement import Array, Measurement
 from ..core.sensors.cloud import columns
 from ..core.sensors.odometry import DECODERS as ODOMETRY
 from ..core.sensors.odometry import TRANSFORMS, OdometryPose, decode_transforms
@@ -154,6 +154,6 @@ def _poses(inputs: BagInputs, topic: str) -> Iterator[Array]:
             except Exception:  # noqa: BLE001, S112  # as above
                 continue
             told = ODOMETRY[record.type](message, "")
-            for pose in [told] if isinstance(told, OdometryPose) else told:
-                assert isinstance(pose, OdometryPose)
-                yield pose.pose
+            for each in [told] if isinstance(told, Measurement) else told:
+                assert isinstance(each, OdometryPose)
+                yield each.pose

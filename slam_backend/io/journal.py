@@ -46,13 +46,15 @@ class Row(NamedTuple):
 class Journal:
     """Append from any thread; `committed` is the id of the newest row that readers can see.
 
-    lost: records that could not be kept, since the file could not be written for long.
+    lost: records that could not be kept, since the file could not be written for long. trouble: why it cannot be
+    written just now; empty: it can.
     """
 
     def __init__(self, folder: Path, failed: Callable[[str], None]) -> None:
         """Open or continue the journal in a folder. BadFile if it cannot be. failed: told in words when writing begins to fail."""
         self.path = folder / NAME
         self.committed = self.lost = 0
+        self.trouble = ""
         self._failed = failed
         self._queue: deque[tuple[str, str, int, bytes]] = deque()
         self._arrival = threading.Lock()
@@ -78,15 +80,18 @@ class Journal:
         """Records that are in memory only."""
         return len(self._queue)
 
-    def append(self, topic: str, type_: str, data: bytes) -> None:
-        """Never blocks."""
-        if len(self._queue) >= LIMIT:
-            self.lost += 1
-            return
+    def append(self, topic: str, type_: str, data: bytes) -> bool:
+        """Never blocks. False once the journal is being closed: then nothing is kept."""
         with self._arrival:  # the order of the queue is that of the log times
+            if self._stop.is_set():
+                return False
+            if len(self._queue) >= LIMIT:
+                self.lost += 1
+                return True
             self._newest = max(self._newest + 1, time_ns())
             self._queue.append((topic, type_, self._newest, data))
         self._wake.set()
+        return True
 
     def wait(self, after: int, timeout: float, unless: Callable[[], bool] = lambda: False) -> bool:
         """Until there are rows beyond `after` or, after a nudge, something else is true, or the timeout (s) has passed."""
@@ -100,12 +105,13 @@ class Journal:
 
     def close(self) -> None:
         """Commit what is queued; afterwards the one file holds everything."""
-        self._stop.set()
+        with self._arrival:
+            self._stop.set()
         self._wake.set()
         self._thread.join()
 
     def _write(self) -> None:
-        database, failing = self._database, False
+        database = self._database
         topics = {
             (name, type_): id_ for id_, name, type_ in database.execute("SELECT id, name, type FROM topics")
         }
@@ -116,11 +122,11 @@ class Journal:
             batch = [self._queue[n] for n in range(len(self._queue))]  # they stay until they are in the file
             try:
                 topics |= self._commit(database, topics, batch)
-                failing = False
+                self.trouble = ""
             except sqlite3.Error as error:
-                if not failing:
-                    self._failed(f"{self.path}: cannot be written: {error}; what comes waits in memory")
-                failing = True
+                news, self.trouble = not self.trouble, f"{self.path}: cannot be written: {error}"
+                if news:
+                    self._failed(f"{self.trouble}; what comes waits in memory")
                 if self._stop.wait(RETRY):
                     break
                 self._wake.set()

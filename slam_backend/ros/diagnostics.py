@@ -10,12 +10,14 @@ from diagnostic_msgs.msg import DiagnosticArray
 from ..core.config import Config
 from ..io.encode import Status, encode_diagnostics
 from ..io.feeder import Feeder
+from ..io.inputs import TF_STATIC
 from ..io.journal import Journal
-from .inputs import Flow
+from .inputs import Inputs
 from .state import State
 
 OK, WARN, ERROR = 0, 1, 2
 SILENT = 3.0  # s without a message after which a source is silent
+FRESH = 10.0  # s for which an incident is the news
 BEHIND = 2000  # rows that the worker has yet to read, beyond which it is behind
 
 
@@ -24,41 +26,56 @@ class Diagnostics:
         self._node, self._state = node, state
         self._publisher = node.create_publisher(DiagnosticArray, "/diagnostics", 10)
 
-    def publish(
-        self, flows: Mapping[str, Flow], feeder: Feeder | None, journal: Journal | None, config: Config
-    ) -> None:
-        name, resolve = self._node.get_name(), self._node.resolve_topic_name
+    def close(self) -> None:
+        self._node.destroy_publisher(self._publisher)
+
+    def publish(self, inputs: Inputs, feeder: Feeder | None, journal: Journal | None, config: Config) -> None:
+        name = self._node.get_name()
         statuses = [
-            _status(f"{name}: {source}", *self._source(source, flows.get(resolve(setting.topic))))
+            _status(f"{name}: {source}", *self._source(source, setting.topic, inputs))
             for source, setting in config.sources.items()
         ]
+        static = inputs.flows.get(self._node.resolve_topic_name(TF_STATIC))
+        if static is not None and static.incompatible:
+            statuses.append(_status(f"{name}: {TF_STATIC}", ERROR, static.incompatible, {"qos": static.qos}))
         statuses.append(_status(f"{name}: solver", *self._worker(feeder, journal)))
         stamp = self._node.get_clock().now().nanoseconds
         self._publisher.publish(encode_diagnostics(stamp, statuses))
 
-    def _source(self, source: str, flow: Flow | None) -> tuple[int, str, dict[str, str]]:
+    def _source(self, source: str, topic: str, inputs: Inputs) -> tuple[int, str, dict[str, str]]:
         refused = {rule: str(n) for (who, rule), n in self._state.refused.items() if who == source}
+        values = {"topic": topic, **refused}
+        if topic in inputs.unreadable:
+            return ERROR, f"the topic has {inputs.unreadable[topic]}, which its kind cannot read", values
+        flow = inputs.flows.get(topic)
         if flow is None:
-            return ERROR, "no publisher on the topic", refused
-        age = monotonic() - flow.newest if flow.newest else float("inf")
-        values = {"rate_hz": f"{flow.rate():.1f}", "age_s": f"{age:.2f}", "qos": flow.reliability, **refused}
+            return ERROR, "no publisher on the topic", values
+        values |= {"rate_hz": f"{flow.rate():.1f}", "publishers": str(flow.publishers), "qos": flow.qos}
+        age = monotonic() - flow.newest if flow.newest else None
+        if age is not None:
+            values["age_s"] = f"{age:.2f}"
         if flow.incompatible:
             return ERROR, flow.incompatible, values
-        if age > SILENT:
-            return WARN, "silent", values
+        if not flow.publishers:
+            return ERROR, "its publisher is gone", values
+        if age is None or age > SILENT:
+            return WARN, "silent" if age is None else f"silent for {age:.0f} s", values
         return (WARN, f"refused: {', '.join(refused)}", values) if refused else (OK, "receiving", values)
 
     def _worker(self, feeder: Feeder | None, journal: Journal | None) -> tuple[int, str, dict[str, str]]:
-        report, update, incidents = self._state.report, self._state.update, self._state.incidents
-        values: dict[str, str] = {"incidents": str(len(incidents))}
-        if incidents:
-            values["last_incident"] = incidents[-1]
+        report, update = self._state.report, self._state.update
+        when, what = self._state.incidents[-1] if self._state.incidents else (0.0, "")
+        values = {"incidents": str(len(self._state.incidents))}
+        if what:
+            values |= {"last_incident": what, "last_incident_age_s": f"{monotonic() - when:.0f}"}
         if feeder is None or journal is None:
             return WARN, "waiting for a source", values
         values |= {
             "alive": str(feeder.alive).lower(),
             "queue": str(feeder.backlog),
             "restarts": str(feeder.restarts),
+            "unwritten": str(journal.waiting),
+            "lost": str(journal.lost),
         }
         if report is not None:
             values |= {
@@ -78,8 +95,10 @@ class Diagnostics:
             }
         if not feeder.alive:
             return ERROR, "the worker is dead; another is being started", values
-        if incidents:
-            return ERROR, incidents[-1], values
+        if journal.trouble:
+            return ERROR, journal.trouble, values
+        if what and monotonic() - when < FRESH:
+            return ERROR, what, values
         if feeder.backlog > BEHIND:
             return WARN, f"the worker is {feeder.backlog} records behind", values
         return OK, "solving", values

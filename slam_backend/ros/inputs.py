@@ -1,6 +1,6 @@
 """Topics to the journal: raw subscriptions whose QoS fits the publishers that are there."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from importlib import import_module
 from time import monotonic
@@ -17,6 +17,9 @@ from ..io.inputs import TF_STATIC
 
 DEPTH = 2000  # messages; a full queue drops the oldest silently, even when reliable
 Received = Callable[[str, str, bytes], None]  # topic, type, CDR
+BEST_EFFORT, RELIABLE = ReliabilityPolicy.BEST_EFFORT, ReliabilityPolicy.RELIABLE
+LATCHED, VOLATILE = DurabilityPolicy.TRANSIENT_LOCAL, DurabilityPolicy.VOLATILE
+MARK = "/map_to_odom"  # how the outputs of a node like this are known: they lie beside it
 
 
 @dataclass(slots=True)
@@ -25,10 +28,12 @@ class Flow:
 
     type: str
     count: int = 0
-    newest: float = 0.0  # s on the monotonic clock
+    newest: float = 0.0  # s on the monotonic clock; 0: nothing yet
     since: float = field(default_factory=monotonic)
-    reliability: str = ""
+    publishers: int = 0
+    qos: str = ""
     incompatible: str = ""
+    twins: set[bytes] | None = None  # while two subscriptions hear the same messages
 
     def rate(self) -> float:
         """Messages per second since the last call."""
@@ -36,90 +41,139 @@ class Flow:
         rate, self.count, self.since = self.count / max(now - self.since, 1e-3), 0, now
         return rate
 
+    def is_first(self, data: bytes) -> bool:
+        """Count a message; False if it has been heard already."""
+        self.newest = monotonic()
+        if self.twins is not None:
+            if data in self.twins:
+                return False
+            self.twins.add(data)
+        self.count += 1
+        return True
+
 
 class Inputs:
-    """Subscribes to the topics of the sources, or to everything that could be one when there are none."""
+    """Subscribes to the topics of the sources; with `finding`, also to everything that could be one.
 
-    def __init__(self, node: Node, received: Received) -> None:
-        self._node, self._received = node, received
+    unreadable: topic of a source -> the types on it, where its kind can read none of them.
+    """
+
+    def __init__(self, node: Node, received: Received, *, finding: bool) -> None:
+        self._node, self._received, self._finding = node, received, finding
         self._subscriptions: dict[str, tuple[Subscription, ReliabilityPolicy, DurabilityPolicy]] = {}
+        self._retired: list[tuple[Subscription, Flow]] = []
+        self._ignored: set[str] = set()
+        self._static: str = node.resolve_topic_name(TF_STATIC)
         self.flows: dict[str, Flow] = {}
+        self.unreadable: dict[str, str] = {}
 
     def look(self, config: Config) -> None:
-        """Subscribe to what has appeared on the graph since the last look; cheap enough for twice a second."""
+        """Subscribe to what has appeared on the graph since the last look; cheap enough for several times a second."""
+        for subscription, flow in self._retired:
+            self._node.destroy_subscription(subscription)
+            flow.twins = None
+        self._retired.clear()
         for topic, type_ in self._wanted(config).items():
             offered = [info.qos_profile for info in self._node.get_publishers_info_by_topic(topic)]
-            if not offered:
-                continue
-            best_effort = any(qos.reliability == ReliabilityPolicy.BEST_EFFORT for qos in offered)
-            latched = all(qos.durability == DurabilityPolicy.TRANSIENT_LOCAL for qos in offered)
-            reliability = ReliabilityPolicy.BEST_EFFORT if best_effort else ReliabilityPolicy.RELIABLE
-            durability = DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE
-            present = self._subscriptions.get(topic)
-            if present is None or (best_effort and present[1] == ReliabilityPolicy.RELIABLE):
-                self._subscribe(topic, type_, reliability, durability)
+            if offered:
+                self._match(topic, type_, offered)
+            elif topic in self.flows:
+                self.flows[topic].publishers = 0
+
+    def ignore(self, topic: str) -> None:
+        """What came on it is of no use: listen no more."""
+        self._ignored.add(topic)
+        self.flows.pop(topic, None)
+        if topic in self._subscriptions:
+            self._node.destroy_subscription(self._subscriptions.pop(topic)[0])
 
     def close(self) -> None:
-        for subscription, *_ in self._subscriptions.values():
+        for subscription, *_ in (*self._subscriptions.values(), *self._retired):
             self._node.destroy_subscription(subscription)
         self._subscriptions.clear()
+        self._retired.clear()
 
     def _wanted(self, config: Config) -> dict[str, str]:
         """Topics that are on the graph and can be read: topic -> type."""
-        resolve = self._node.resolve_topic_name
-        sources = {resolve(source.topic): source.kind for source in config.sources.values()}
+        kinds = {source.topic: source.kind for source in config.sources.values()}
+        there = dict(self._node.get_topic_names_and_types())
+        home = str(self._node.get_namespace()).rstrip("/") + "/"
+        foreign = tuple(topic.removesuffix(MARK[1:]) for topic in there if topic.endswith(MARK))
         found: dict[str, str] = {}
-        own = self._node.get_fully_qualified_name() + "/"
-        for topic, types in self._node.get_topic_names_and_types():
-            for type_ in types:
-                if topic == TF_STATIC:
-                    fits = type_ in SENSORS["static"].decoders
-                elif sources:
-                    fits = topic in sources and type_ in SENSORS[sources[topic]].decoders
-                else:
-                    fits = not topic.startswith(own) and type_ in _ANYTHING
-                if fits and _message_class(type_) is not None:
-                    found[topic] = type_
+        self.unreadable.clear()
+        for topic, types in there.items():
+            if topic == self._static:
+                readable: Sequence[str] = tuple(SENSORS["static"].decoders)
+            elif topic in kinds:
+                readable = tuple(SENSORS[kinds[topic]].decoders)
+            elif not self._finding or topic in self._ignored or topic.startswith(foreign):
+                continue
+            else:
+                readable = _ANYTHING if topic.startswith(home) else ()
+            fits = [type_ for type_ in types if type_ in readable and _message_class(type_) is not None]
+            if fits:
+                found[topic] = fits[0]
+            elif topic in kinds:
+                self.unreadable[topic] = ", ".join(types)
         return found
+
+    def _match(self, topic: str, type_: str, offered: Sequence[QoSProfile]) -> None:
+        """A subscription that hears all of these publishers, as far as one can."""
+        latched = topic == self._static or all(qos.durability == LATCHED for qos in offered)
+        reliability = BEST_EFFORT if any(qos.reliability == BEST_EFFORT for qos in offered) else RELIABLE
+        durability = LATCHED if latched else VOLATILE
+        present = self._subscriptions.get(topic)
+        if present is not None:  # it hears more rather than less, whoever leaves
+            reliability = BEST_EFFORT if present[1] == BEST_EFFORT else reliability
+            durability = VOLATILE if present[2] == VOLATILE else durability
+        if present is None or present[1:] != (reliability, durability):
+            self._subscribe(topic, type_, reliability, durability)
+        flow = self.flows[topic]
+        flow.publishers = len(offered)
+        unheard = sum(durability == LATCHED and qos.durability != LATCHED for qos in offered)
+        flow.incompatible = (
+            f"QoS: {unheard} of {len(offered)} publishers offer volatile durability where transient local is needed"
+            if unheard
+            else ""
+        )
 
     def _subscribe(
         self, topic: str, type_: str, reliability: ReliabilityPolicy, durability: DurabilityPolicy
     ) -> None:
-        if topic in self._subscriptions:
-            self._node.destroy_subscription(self._subscriptions[topic][0])
+        flow = self.flows.setdefault(topic, Flow(type_))
+        flow.qos = f"{reliability.name.lower()}, {durability.name.lower()}"
+        if topic in self._subscriptions:  # the old one goes at the next look: in between nothing is missed
+            flow.twins = set()
+            self._retired.append((self._subscriptions[topic][0], flow))
         qos = QoSProfile(
             history=HistoryPolicy.KEEP_LAST, depth=DEPTH, reliability=reliability, durability=durability
         )
-        flow = self.flows.setdefault(topic, Flow(type_))
-        flow.reliability = reliability.name.lower()
+        name = TF_STATIC if topic == self._static else topic
 
         def received(data: bytes) -> None:
-            flow.count += 1
-            flow.newest = monotonic()
-            self._received(topic, type_, data)
-
-        def incompatible(info: Any) -> None:
-            flow.incompatible = (
-                f"a publisher's {info.last_policy_kind.name.lower()} does not fit our subscription"
-            )
+            if flow.is_first(data):
+                self._received(name, type_, data)
 
         subscription = self._node.create_subscription(
             _message_class(type_), topic, received, qos, raw=True,
-            event_callbacks=SubscriptionEventCallbacks(incompatible_qos=incompatible, use_default_callbacks=False),
+            event_callbacks=SubscriptionEventCallbacks(use_default_callbacks=False),
         )  # fmt: skip
         self._subscriptions[topic] = (subscription, reliability, durability)
-        self._node.get_logger().info(f"listening to {topic} ({type_}, {flow.reliability})")
+        self._node.get_logger().info(f"listening to {topic} ({type_}; {flow.qos})")
 
 
-_ANYTHING: Mapping[str, None] = {
-    type_: None for kind, sensor in SENSORS.items() if kind != "static" for type_ in sensor.decoders
-}
+_ANYTHING: Sequence[str] = [
+    type_ for kind, sensor in SENSORS.items() if kind != "static" for type_ in sensor.decoders
+]
+_classes: dict[str, Any] = {}
 
 
 def _message_class(type_: str) -> Any:
     """The class of a type, to declare a subscription with; None where its package is not installed."""
-    package, _, name = type_.split("/")
-    try:
-        return getattr(import_module(f"{package}.msg"), name)
-    except (ImportError, AttributeError):
-        return None
+    if type_ not in _classes:
+        package, _, name = type_.split("/")
+        try:
+            _classes[type_] = getattr(import_module(f"{package}.msg"), name)
+        except (ImportError, AttributeError):
+            _classes[type_] = None
+    return _classes[type_]

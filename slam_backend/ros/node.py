@@ -2,54 +2,62 @@
 
 The way of a message: raw bytes -> journal -> worker (another process). The way back: report -> State -> a guard
 condition wakes the executor -> publishers. ~/odometry is made here, from the newest correction and the newest odometry,
-so that it never waits for the solver. No callback blocks.
+so that it never waits for the solver. No callback blocks, and none ends the node.
 """
 
 import signal
 import sys
 import threading
-from collections.abc import Callable
+from collections import deque
+from collections.abc import Callable, Sequence
 from functools import wraps
+from itertools import count
 from pathlib import Path
 from time import monotonic
 from typing import Any
 
 import rclpy
 from rclpy.clock import Clock, ClockType
-from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.executors import SingleThreadedExecutor
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.parameter import Parameter
+from rclpy.signals import SignalHandlerOptions
 
+from ..core.check import checked
 from ..core.config import Config, config_from, config_to
-from ..core.errors import BadFile, SlamError
+from ..core.errors import SlamError
+from ..core.graph import Decision
 from ..core.measurement import SECOND
-from ..core.sensors.odometry import OdometryPose
+from ..core.sensors.odometry import TRANSFORMS, OdometryPose
 from ..io.cdr import Decoder
-from ..io.discover import is_truth, kind_of, name_of
-from ..io.feeder import Feeder
+from ..io.feeder import Feeder, undisturbed
 from ..io.inputs import TF_STATIC
-from ..io.journal import NAME as JOURNAL
-from ..io.journal import Journal
+from ..io.journal import LIMIT
 from ..io.records import Record
 from ..io.typestore import typestore_of
 from .diagnostics import Diagnostics
+from .finder import Finder
 from .inputs import Inputs
 from .outputs import Outputs
-from .parameters import changed, config_of, declare, overrides
+from .parameters import changed, config_of, declare
 from .pose import Odometer
 from .services import Services
+from .session import RUN, Session
 from .state import State
 
 LOOK = 0.3  # s between two looks at the graph
+BEAT = 0.1  # s within which a signal is heard
 JUMP = SECOND  # ns that the driving source must go back for its clock to have jumped
 WATCHED = ("path", "trajectory", "landmarks", "graph")  # outputs that are made from a snapshot
 FAREWELL = 30.0  # s that the worker may take to flush and save at the end
+DEFAULT_ODOM = Config().odom_frame
+AGAIN = 5.0  # s after which the same incident is worth another line
+STEADY = Clock(clock_type=ClockType.STEADY_TIME)  # timers run whether or not /clock does
+Transition = Callable[["BackendNode", LifecycleState], TransitionCallbackReturn]
 
 
-def _explained(
-    transition: Callable[..., TransitionCallbackReturn],
-) -> Callable[..., TransitionCallbackReturn]:
-    """Rclpy swallows what a transition raises; say it, and fail."""
+def _explained(transition: Transition) -> Transition:
+    """Rclpy swallows what a transition raises; say it, let go of everything, and fail."""
 
     @wraps(transition)
     def wrapped(node: "BackendNode", state: LifecycleState) -> TransitionCallbackReturn:
@@ -59,32 +67,55 @@ def _explained(
             node.get_logger().error(str(error))
         except Exception as error:  # noqa: BLE001  # whatever it is, it must be said
             node.get_logger().error(f"{transition.__name__}: {type(error).__name__}: {error}")
+        if transition.__name__ == "on_configure":
+            node.close()
         return TransitionCallbackReturn.FAILURE
 
     return wrapped
 
 
+def _survived(callback: Callable[..., None]) -> Callable[..., None]:
+    """What leaves a callback would end the node: it becomes an incident."""
+
+    @wraps(callback)
+    def wrapped(node: "BackendNode", *arguments: Any) -> None:
+        try:
+            callback(node, *arguments)
+        except Exception as error:  # noqa: BLE001  # whatever it is
+            what = " ".join(str(error).split())
+            node.incident(f"{callback.__name__.strip('_')} failed: {type(error).__name__}: {what}")
+
+    return wrapped
+
+
 class BackendNode(LifecycleNode):
-    def __init__(self, name: str = "slam_backend", **options: Any) -> None:
-        """BadConfig when the parameters make no configuration."""
+    def __init__(self, name: str = "slam_backend", start: Config | None = None, **options: Any) -> None:
+        """start: what the parameters override. BadConfig when they make no configuration."""
         super().__init__(name, automatically_declare_parameters_from_overrides=True, **options)
-        self.config = config_of(self)
-        declare(self, self.config)
-        self.add_on_set_parameters_callback(self._set_parameters)
+        given = config_of(self, start or Config())
+        declare(self, given)
+        self.config = self._given = _resolved(given, self.resolve_topic_name)
+        self.add_on_set_parameters_callback(lambda new: changed(self.config, new)[1])
+        self.add_post_set_parameters_callback(self._parameters_were_set)
         self.state = State(self._wake)
         self._typestore = typestore_of(())
         self._changed = self.create_guard_condition(self._publish)
         self._refresh = threading.Event()
-        self._journal: Journal | None = None
-        self._feeder: Feeder | None = None
+        self._session: Session | None = None
+        self._early: deque[tuple[str, str, bytes]] = deque(maxlen=LIMIT)  # heard between two sessions
+        self._doubtful: list[tuple[str, str, bytes]] = []  # it went back in time; the next one tells
+        self._finder: Finder | None = None  # where no sources are configured
         self._inputs: Inputs | None = None
         self._outputs: Outputs | None = None
         self._answering: Services | None = None
-        self._decoder: Decoder | None = None
-        self._beats: list[Any] = []
-        self._kinds: dict[str, str | None] = {}  # topics whose first message has been looked at
+        self._diagnostics: Diagnostics | None = None
+        self._decoder = Decoder(self._typestore, {})  # of the driving source
         self._odometer = Odometer(self.config)
-        self._closing = False
+        self._beats: dict[str, Any] = {}
+        self._count = count(1)
+        self._changing = threading.Lock()  # a session ends, or begins
+        self._closed = threading.Event()
+        self._closed.set()
 
     @property
     def data_dir(self) -> Path:
@@ -96,31 +127,32 @@ class BackendNode(LifecycleNode):
 
     @_explained
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:  # noqa: ARG002
-        self._open()
-        self._closing = False
-        self._outputs = Outputs(
-            self,
-            self.config,
-            self.config.map_frame,
-            self.config.odom_frame,
-            self.config.base_frame or "base_link",
-        )
-        self._answering = Services(
-            self, self.state, lambda: self._feeder, self._refresh.set, self.data_dir, self.config, self.reset
-        )
+        self._closed = threading.Event()
+        self.state.clear()
+        self._early.clear()
+        self.config = self._given
+        self._finder = None if self._given.sources else Finder(self._typestore)
+        frames = self.config.map_frame, self.config.odom_frame, self.config.base_frame or "base_link"
+        self._outputs = Outputs(self, self.config, *frames)
+        self._outputs.set_active(False)
         self._diagnostics = Diagnostics(self, self.state)
-        threading.Thread(target=self._snapshots, name="snapshots", daemon=True).start()
+        self._session = self._opened()
+        with undisturbed():  # the services start a process
+            self._answering = Services(
+                self, self.state, self._feeder, self._refresh.set, self.data_dir, self.config, self.reset
+            )
+        threading.Thread(target=self._snapshots, args=(self._closed,), name="snapshots", daemon=True).start()
         return TransitionCallbackReturn.SUCCESS
 
     @_explained
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:  # noqa: ARG002
-        self._inputs = Inputs(self, self._received)
-        steady = Clock(clock_type=ClockType.STEADY_TIME)  # timers run whether or not /clock does
-        self._beats = [
-            self.create_timer(LOOK, self._look, clock=steady),
-            self.create_timer(1.0 / self.config.path.rate, self._refresh_if_watched, clock=steady),
-            self.create_timer(1.0, self._diagnose, clock=steady),
-        ]
+        self._inputs = Inputs(self, self._received, finding=self._finder is not None)
+        table: dict[str, tuple[float, Callable[[], None]]] = {
+            "look": (LOOK, self._look),
+            "refresh": (1.0 / self.config.path.rate, self._refresh_if_watched),
+            "diagnose": (1.0, self._diagnose),
+        }
+        self._beats = {name: self.create_timer(*beat, clock=STEADY) for name, beat in table.items()}
         if self._outputs is not None:
             self._outputs.set_active(True)
         self._look()
@@ -129,8 +161,6 @@ class BackendNode(LifecycleNode):
     @_explained
     def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:  # noqa: ARG002
         self._silence()
-        if self._outputs is not None:
-            self._outputs.set_active(False)
         return TransitionCallbackReturn.SUCCESS
 
     @_explained
@@ -153,150 +183,186 @@ class BackendNode(LifecycleNode):
             return response
 
     def close(self) -> None:
-        """Flush, save the run, let go of everything. Safe to call twice."""
-        if self._closing:
-            return
-        self._closing = True
+        """Save the run, let go of everything. Safe to call twice."""
+        self._closed.set()
+        self._refresh.set()
         self._silence()
-        self._end_session("run")
-        for part in (self._answering, self._outputs):
+        with self._changing:
+            session, self._session = self._session, None
+            if session is not None:
+                self._end(session)
+        for part in (self._answering, self._outputs, self._diagnostics):
             if part is not None:
                 part.close()
-        self._answering = self._outputs = None
+        self._answering = self._outputs = self._diagnostics = None
 
     def reset(self) -> None:
-        """A new session: the run so far is saved, its journal set aside, the map starts empty. Takes a while; any thread."""
-        self._end_session("run")
-        self.state.clear()
-        self._kinds.clear()
-        self._open()
+        """A new session: the run so far is saved, its journal set aside, the map starts empty. Takes a while; any thread.
+
+        What is heard meanwhile waits for the new session.
+        """
+        with self._changing:
+            if self._closed.is_set():
+                raise SlamError("there is no session: the node is not configured")
+            session, self._session = self._session, None
+            if session is not None:
+                self._end(session)
+            self.state.clear()
+            self._odometer = Odometer(self.config)
+            self._session = self._opened()
         self.get_logger().info("a new session has begun")
 
-    # -- session ---------------------------------------------------------------------------------
-
-    def _open(self) -> None:
-        """Journal and worker. BadFile where the data directory cannot be used."""
-        folder = self.data_dir
-        _set_aside(folder / JOURNAL)
-        self._journal = Journal(folder, self._incident)
-        self._odometer = Odometer(self.config)
-        if self.config.sources:
-            self._start(self.config)
-
-    def _start(self, config: Config) -> None:
-        """A worker for these sources; one that runs already is replaced, and reads the journal from its start."""
-        assert self._journal is not None
-        if self._feeder is not None:
-            self._feeder.close()
-        self.config = config
-        resolve = self.resolve_topic_name
-        table = {resolve(source.topic): (name, source.kind) for name, source in config.sources.items()}
-        self._decoder = Decoder(self._typestore, table)
-        self._feeder = Feeder(
-            self._journal, config, table | {TF_STATIC: (TF_STATIC, "static")}, self.state.take, self._incident
-        )
-
-    def _end_session(self, folder: str) -> None:
-        journal, feeder = self._journal, self._feeder
-        self._journal = self._feeder = None
-        if journal is not None:
-            journal.close()
-        if feeder is None:
-            return
-        try:
-            summary = feeder.finish(str(self.data_dir / folder), FAREWELL)
-            self.get_logger().info(f"saved {self.data_dir / folder}: run hash {summary['run_hash'][:16]}")
-        except SlamError as error:
-            self.get_logger().error(
-                f"the run was not saved ({error}); its journal is {journal.path if journal else 'lost'}"
-            )
-
     def _silence(self) -> None:
-        for timer in self._beats:
+        """Neither listen nor publish."""
+        for timer in self._beats.values():
             self.destroy_timer(timer)
-        self._beats = []
+        self._beats = {}
         if self._inputs is not None:
             self._inputs.close()
             self._inputs = None
+        if self._outputs is not None:
+            self._outputs.set_active(False)
 
-    def _incident(self, what: str) -> None:
-        self.state.incidents.append(what)
-        self.get_logger().error(what)
+    # -- session ---------------------------------------------------------------------------------
+
+    def _opened(self) -> Session:
+        """Journal and worker. BadFile where the data directory cannot be used."""
+        session = Session(self.data_dir, self.state, self.incident)
+        if self.config.sources:
+            self._work(session, self.config)
+        return session
+
+    def _work(self, session: Session, config: Config) -> None:
+        """Solve with these sources from the start of the session on."""
+        self.config = config
+        assert config.driver is not None
+        source = config.sources[config.driver]
+        drives = {source.topic: (config.driver, source.kind)} if source.kind == "odometry" else {}
+        self._decoder = Decoder(self._typestore, drives)
+        self._odometer = Odometer(config)
+        session.work(config)
+
+    def _end(self, session: Session) -> None:
+        folder = self.data_dir / RUN
+        try:
+            summary = session.end(FAREWELL)
+        except SlamError as error:
+            self.get_logger().error(f"the run was not saved: {error}; its journal is {session.journal.path}")
+            return
+        self.get_logger().info(
+            f"saved {folder}: run hash {summary['run_hash'][:16]}"
+            if summary
+            else "no source was heard: there is no run to save"
+        )
+
+    def _feeder(self) -> Feeder | None:
+        session = self._session
+        return session.feeder if session is not None else None
+
+    def incident(self, what: str) -> None:
+        """Say that something went wrong; from any thread."""
+        past = list(self.state.incidents)
+        stamp = self.state.update.keyframe.stamp if self.state.update else 0
+        decision = Decision(
+            stamp, f"incident/{next(self._count)}", "node", "removed", "node", "incident", what
+        )
+        self.state.happen(what, decision)
+        if not any(said == what and monotonic() - when < AGAIN for when, said in past):
+            self.get_logger().error(what)
 
     # -- the way in ------------------------------------------------------------------------------
 
+    @_survived
     def _look(self) -> None:
         if self._inputs is not None:
             self._inputs.look(self.config)
 
+    @_survived
     def _received(self, topic: str, type_: str, data: bytes) -> None:
-        if self._journal is None:
-            return
-        self._journal.append(topic, type_, data)
-        if topic not in self._kinds and topic != TF_STATIC:
-            self._recognize(Record(topic, type_, 0, data))
-        if self._decoder is not None:
-            for item in self._decoder.decode(Record(topic, type_, 0, data)) if self._drives(topic) else ():
-                if isinstance(item, OdometryPose):
-                    self._moved(item)
+        self._early.append((topic, type_, data))
+        while self._early and self._session is not None:
+            self._take(self._session, *self._early.popleft())
 
-    def _drives(self, topic: str) -> bool:
+    def _take(self, session: Session, topic: str, type_: str, data: bytes) -> None:
+        record = Record(topic, type_, 0, data)
+        if self._finder is not None and not self._is_wanted(session, record, self._finder):
+            return
+        odometry = self._odometry_in(record)
+        for item in odometry:
+            if self._odometer.jumped_back(item.stamp, JUMP) and self._begins_anew(item.source):
+                self._early.extendleft([(topic, type_, data), *self._doubtful])
+                return
+            self._doubtful = [(topic, type_, data)] if self._odometer.doubts else []
+        of_other_frames = type_ == TRANSFORMS and topic in self._driving and not odometry
+        if not of_other_frames and not session.journal.append(topic, type_, data):
+            self._early.appendleft((topic, type_, data))  # the session has just ended
+            return
+        for item in odometry:
+            self._moved(item)
+
+    @property
+    def _driving(self) -> Sequence[str]:
+        """The topic of the odometry, if one drives."""
         driver = self.config.driver
-        return driver is not None and self.resolve_topic_name(self.config.sources[driver].topic) == topic
+        return () if driver is None else (self.config.sources[driver].topic,)
+
+    def _is_wanted(self, session: Session, record: Record, finder: Finder) -> bool:
+        """Without configured sources: whether the message is worth keeping; a new source gets a worker that knows it."""
+        if record.topic == TF_STATIC:
+            return True
+        config = finder.look(record, self.config)
+        if config is not self.config:
+            for name in set(config.sources) - set(self.config.sources):
+                source = config.sources[name]
+                self.get_logger().info(f"{source.topic} is used as {source.kind}")
+            self._work(session, config)
+        if record.topic in finder.unused and self._inputs is not None and record.topic in self._inputs.flows:
+            self.get_logger().info(f"{record.topic} is left aside: {finder.unused[record.topic]}")
+            self._inputs.ignore(record.topic)
+        return finder.wants(record.topic)
+
+    def _odometry_in(self, record: Record) -> list[OdometryPose]:
+        """What the driving source says in it, unless it cannot be right."""
+        told = self._decoder.decode(record)
+        return [item for item in checked(told, self.config) if isinstance(item, OdometryPose)] if told else []
+
+    def _begins_anew(self, source: str) -> bool:
+        choice = self.config.on_clock_jump
+        self.incident(f"the clock of '{source}' jumped back; on_clock_jump: {choice}")
+        if choice == "reset":
+            threading.Thread(target=self._reset_in_background, name="reset", daemon=True).start()
+        return choice == "reset"
 
     def _moved(self, odometry: OdometryPose) -> None:
-        if self._odometer.jumped_back(odometry.stamp, JUMP):
-            self._incident(
-                f"the clock of '{odometry.source}' jumped back; on_clock_jump: {self.config.on_clock_jump}"
-            )
-            if self.config.on_clock_jump == "reset":
-                threading.Thread(target=self.reset, name="reset", daemon=True).start()
-                return
+        outputs = self._outputs
+        if outputs is None or not self._odometer.goes_on(odometry.stamp):
+            return
         pose = self._odometer.locate(odometry, self.state.update, self.state.covariance)
-        if pose is not None and self._outputs is not None:
-            self._outputs.odometry(
-                odometry.stamp,
-                pose.seven,
-                pose.covariance,
-                odometry.child or "base_link",
-                odometry.twist,
-                odometry.twist_covariance,
-            )
-            self._outputs.map_to_odom(odometry.stamp, pose.correction)
-
-    def _recognize(self, record: Record) -> None:
-        """Without configured sources: what a topic is, by its first message."""
-        resolve = self.resolve_topic_name
-        if any(resolve(source.topic) == record.topic for source in self.config.sources.values()):
-            self._kinds[record.topic] = None
+        if pose is None:
             return
-        kind = None if is_truth(record.topic) else kind_of(record, self._typestore)
-        self._kinds[record.topic] = kind
-        driver = self.config.driver
-        odometry_known = driver is not None and self.config.sources[driver].kind == "odometry"
-        if kind is None or (kind == "odometry" and odometry_known):
-            return
-        found = {"kind": kind, "topic": record.topic}
-        data = config_to(self.config)
-        name = name_of(record.topic)
-        sources = [*data["sources"], name]
-        config = config_from({**data, "sources": sources, name: found}) if kind != "pose" or driver else None
-        if config is None or config.driver is None:
-            del self._kinds[record.topic]  # to be looked at again when something drives
-            return
-        self.get_logger().info(f"{record.topic} is used as {kind}")
-        self._start(config)
+        if odometry.frame not in ("", self.config.map_frame) and self.config.odom_frame == DEFAULT_ODOM:
+            outputs.odom_frame = odometry.frame
+        outputs.odometry(
+            odometry.stamp,
+            pose.seven,
+            pose.covariance,
+            odometry.child,
+            odometry.twist,
+            odometry.twist_covariance,
+        )
+        outputs.map_to_odom(odometry.stamp, pose.correction)
 
     # -- the way out -----------------------------------------------------------------------------
 
     def _wake(self) -> None:
         """From the feeder's thread: let the executor publish."""
-        if not self._closing:
+        if not self._closed.is_set():
             self._changed.trigger()
 
+    @_survived
     def _publish(self) -> None:
         outputs, update = self._outputs, self.state.update
-        if outputs is None:
+        if outputs is None or not self._beats:
             return
         if decisions := self.state.untold_decisions():
             outputs.decisions(decisions)
@@ -309,54 +375,63 @@ class BackendNode(LifecycleNode):
             outputs.landmarks(snapshot)
             outputs.graph(snapshot, list(self.state.decided.values()))
 
-    def _snapshots(self) -> None:
+    def _snapshots(self, closed: threading.Event) -> None:
         """A thread: fetch a snapshot when one is asked for and there is something new."""
-        shown = -1
-        while not self._closing:
+        shown = None
+        while not closed.is_set():
             self._refresh.wait()
             self._refresh.clear()
-            feeder, update = self._feeder, self.state.update
-            if feeder is None or update is None or update.keyframe.index == shown:
+            feeder, update = self._feeder(), self.state.update
+            if closed.is_set() or feeder is None or update is None or update is shown:
                 continue
             begin = monotonic()
             try:
-                self.state.show(feeder.request("snapshot", timeout=FAREWELL))
+                snapshot = feeder.request("snapshot", timeout=FAREWELL)
             except SlamError:
                 continue  # the worker is being replaced; there will be another
-            shown = update.keyframe.index
-            threading.Event().wait(4 * (monotonic() - begin))  # at most a fifth of the worker's time
+            if feeder is self._feeder():
+                self.state.show(snapshot)
+                shown = update
+            closed.wait(4 * (monotonic() - begin))  # at most a fifth of the worker's time
 
+    @_survived
     def _refresh_if_watched(self) -> None:
         if self._outputs is not None and any(map(self._outputs.has_listeners, WATCHED)):
             self._refresh.set()
 
+    @_survived
     def _diagnose(self) -> None:
-        if self._inputs is not None:
-            self._diagnostics.publish(self._inputs.flows, self._feeder, self._journal, self.config)
+        session = self._session
+        if self._inputs is not None and self._diagnostics is not None:
+            self._diagnostics.publish(
+                self._inputs, self._feeder(), session.journal if session else None, self.config
+            )
 
-    def _set_parameters(self, parameters: list[Parameter]) -> Any:
-        config, result = changed(self.config, parameters)
-        if result.successful:
-            self.config = config
-            if self._outputs is not None:
-                self._outputs.config = config
-        return result
+    @_survived
+    def _parameters_were_set(self, parameters: list[Parameter]) -> None:
+        self._given, _ = changed(self._given, parameters)
+        self.config, _ = changed(self.config, parameters)
+        if self._outputs is not None:
+            self._outputs.config = self.config
+        if "refresh" in self._beats:
+            self._beats["refresh"].timer_period_ns = round(SECOND / self.config.path.rate)
+
+    def _reset_in_background(self) -> None:
+        while not self._closed.is_set():
+            try:
+                return self.reset()
+            except SlamError as error:
+                self.incident(str(error))
+                self._closed.wait(AGAIN)
+        return None
 
 
-def _set_aside(journal: Path) -> None:
-    """An earlier session's journal stays, under the next free name."""
-    if not journal.exists():
-        return
-    n = 1
-    while (kept := journal.with_name(f"journal-{n}.db3")).exists():
-        n += 1
-    try:
-        for ending in ("", "-wal", "-shm"):
-            part = journal.with_name(journal.name + ending)
-            if part.exists():
-                part.rename(kept.with_name(kept.name + ending))
-    except OSError as error:
-        raise BadFile(f"{journal}: cannot be set aside: {error}") from None
+def _resolved(config: Config, resolve: Callable[[str], str]) -> Config:
+    """With the topics as they are called on the network, remapping included: so the journal and its replay name them."""
+    data = config_to(config)
+    for name in data["sources"]:
+        data[name]["topic"] = resolve(data[name]["topic"] or name)
+    return config_from(data, "parameters")
 
 
 def main(arguments: list[str] | None = None, config: Config | None = None) -> int:
@@ -364,28 +439,34 @@ def main(arguments: list[str] | None = None, config: Config | None = None) -> in
 
     config: what the parameters start from; ROS arguments override it.
     """
-    rclpy.init(args=arguments)
+    wishes: list[int] = []
+    for wish in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(wish, lambda number, _: wishes.append(number))  # more than one changes nothing
     try:
-        node = BackendNode(parameter_overrides=overrides(config) if config else [])
-    except SlamError as error:
-        sys.stderr.write(f"slam-backend: {error}\n")
+        rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
+        node = BackendNode(start=config)
+    except Exception as error:  # noqa: BLE001  # rclpy's for malformed arguments are no public classes
+        sys.stderr.write(f"slam-backend: {' '.join(str(error).split())}\n")
         rclpy.try_shutdown()
         return 2
+    try:
+        return _run(node, wishes)
+    finally:
+        node.close()
+        node.destroy_node()
+        rclpy.try_shutdown()
+
+
+def _run(node: BackendNode, wishes: Sequence[int]) -> int:
     executor = SingleThreadedExecutor()
     executor.add_node(node)
-    try:
-        if node.config.autostart:
-            if node.trigger_configure() != TransitionCallbackReturn.SUCCESS:
-                return 2  # the reason has been logged
-            node.trigger_activate()
-        executor.spin()
-    except (KeyboardInterrupt, ExternalShutdownException):
-        pass  # both are how one ends a node
-    finally:
-        for wish in (signal.SIGINT, signal.SIGTERM):
-            signal.signal(wish, signal.SIG_IGN)  # a second Ctrl-C must not tear the saving
-        node.close()
-        rclpy.try_shutdown()
+    node.create_timer(BEAT, lambda: None, clock=STEADY)  # Python hears a signal between two callbacks only
+    if node.config.autostart:
+        if node.trigger_configure() != TransitionCallbackReturn.SUCCESS:
+            return 2  # the reason has been logged
+        node.trigger_activate()
+    while not wishes and rclpy.ok():
+        executor.spin_once()
     return 0
 
 

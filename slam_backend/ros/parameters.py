@@ -1,5 +1,6 @@
 """The configuration as ROS parameters: every setting once, declared from where it is written."""
 
+from array import array
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, get_args
 
@@ -17,27 +18,38 @@ FOREIGN = ("use_sim_time", "qos_overrides", "start_type_description_service")  #
 HUGE = 1e308
 
 
-def config_of(node: Node) -> Config:
-    """From the parameters that the node was started with. BadConfig names the setting."""
-    nested: dict[str, Any] = {}
+def config_of(node: Node, start: Config) -> Config:
+    """`start`, overridden by the parameters that the node was given. BadConfig names the setting."""
+    given: dict[str, Any] = {}
     for name, parameter in node.get_parameters_by_prefix("").items():
         if name.split(".")[0] in FOREIGN:
             continue
         *path, leaf = name.split(".")
-        section = nested
+        section = given
         for part in path:
             section = section.setdefault(part, {})
+            if not isinstance(section, dict):
+                raise BadConfig(f"parameters: {name}: '{part}' is a setting, and has none below it")
         value = parameter.value
-        section[leaf] = list(value) if isinstance(value, Sequence) and not isinstance(value, str) else value
-    return config_from(nested, "parameters")
+        section[leaf] = (
+            list(value) if isinstance(value, Sequence | array) and not isinstance(value, str) else value
+        )
+    data = config_to(start)
+    for source in data["sources"]:
+        if source not in given.get("sources", data["sources"]):
+            del data[source]
+    return config_from(_merged(data, given), "parameters")
 
 
-def overrides(config: Config) -> list[Parameter]:
-    """A configuration as the parameters that a node is started with."""
-    found = [
-        (name, value) for name, (value, _) in settings(config).items() if value is not None and value != []
-    ]
-    return [Parameter(name, value=value) for name, value in found]
+def _merged(below: Mapping[str, Any], above: Mapping[str, Any]) -> dict[str, Any]:
+    """What stands above holds."""
+    merged = dict(below)
+    for key, value in above.items():
+        old = merged.get(key)
+        merged[key] = (
+            _merged(old, value) if isinstance(old, Mapping) and isinstance(value, Mapping) else value
+        )
+    return merged
 
 
 def declare(node: Node, config: Config) -> None:

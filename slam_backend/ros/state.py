@@ -3,6 +3,7 @@
 import threading
 from collections import deque
 from collections.abc import Callable
+from time import monotonic
 
 from ..core.backend import Update
 from ..core.graph import Decision
@@ -24,23 +25,36 @@ class State:
         self.snapshot: Snapshot | None = None
         self.decided: dict[str, Decision] = {}
         self.refused: dict[tuple[str, str], int] = {}  # (source, stage/reason) -> count
-        self.incidents: deque[str] = deque(maxlen=100)
+        self.incidents: deque[tuple[float, str]] = deque(
+            maxlen=100
+        )  # s on the monotonic clock, what happened
         self._untold: list[Decision] = []
         self._unshown = False
+        self._behind = 0  # rows that a new worker has yet to read before its updates are news
 
     def take(self, report: Report) -> None:
         with self._lock:
             self.report = report
-            if report.updates:
+            if report.updates and report.applied >= self._behind:
                 self.update, self.covariance = report.updates[-1], report.covariance
             for decision in report.decisions:
-                self._untold.append(decision)
-                self.decided[decision.id] = decision
-                if decision.verdict in ("refused", "removed"):
-                    rule = (decision.source, f"{decision.stage}/{decision.reason}")
-                    self.refused[rule] = self.refused.get(rule, 0) + decision.count
-            while len(self.decided) > DECISIONS:
-                del self.decided[next(iter(self.decided))]
+                self._decide(decision)
+        self._changed()
+
+    def expect(self, rows: int) -> None:
+        """A worker begins anew, with other sources: what was decided will be decided again; the newest pose holds until
+        it has read so many rows.
+        """
+        with self._lock:
+            self._behind = rows
+            self.decided, self.refused, self._untold = {}, {}, []
+
+    def happen(self, what: str, decision: Decision | None = None) -> None:
+        """Something went wrong."""
+        with self._lock:
+            self.incidents.append((monotonic(), what))
+            if decision is not None:
+                self._decide(decision)
         self._changed()
 
     def show(self, snapshot: Snapshot) -> None:
@@ -60,9 +74,19 @@ class State:
         with self._lock:
             self.report = self.update = self.covariance = self.snapshot = None
             self.decided, self.refused, self._untold = {}, {}, []
+            self._unshown, self._behind = False, 0
 
     def untold_decisions(self) -> list[Decision]:
         """Those that have not been published yet; each is handed out once."""
         with self._lock:
             untold, self._untold = self._untold, []
         return untold
+
+    def _decide(self, decision: Decision) -> None:
+        self._untold.append(decision)
+        self.decided[decision.id] = decision
+        if decision.verdict in ("refused", "removed"):
+            rule = (decision.source, f"{decision.stage}/{decision.reason}")
+            self.refused[rule] = self.refused.get(rule, 0) + decision.count
+        while len(self.decided) > DECISIONS:
+            del self.decided[next(iter(self.decided))]

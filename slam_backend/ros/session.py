@@ -1,0 +1,64 @@
+"""One journal, and the worker that reads it."""
+
+import threading
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from ..core.config import Config
+from ..core.errors import BadFile
+from ..io.feeder import Feeder
+from ..io.inputs import TF_STATIC
+from ..io.journal import NAME as JOURNAL
+from ..io.journal import Journal
+from .state import State
+
+RUN = "run"  # the folder, beside the journal, of the run that is saved at the end
+
+
+class Session:
+    """incident: told in words when something went wrong, from any thread."""
+
+    def __init__(self, folder: Path, state: State, incident: Callable[[str], None]) -> None:
+        """An earlier session's journal and run are set aside. BadFile where the folder cannot be used."""
+        self._state, self._incident, self._folder = state, incident, folder
+        _set_aside(folder)
+        self.journal = Journal(folder, incident)
+        self.feeder: Feeder | None = None
+        self._lock, self._ended = threading.Lock(), False
+
+    def work(self, config: Config) -> None:
+        """A worker for these sources; one that runs already is replaced, and the new one reads the journal from its start."""
+        table: dict[str, tuple[str, str]] = {TF_STATIC: (TF_STATIC, "static")}
+        table |= {source.topic: (name, source.kind) for name, source in config.sources.items()}
+        with self._lock:
+            if self._ended:
+                return
+            if self.feeder is not None:
+                self.feeder.close()
+            self._state.expect(self.journal.committed)
+            self.feeder = Feeder(self.journal, config, table, self._state.take, self._incident)
+
+    def end(self, seconds: float) -> Any:
+        """Close the journal, let the worker read it to its end and save; the run's summary, None without a worker.
+
+        SlamError if that did not work, or not in time (s).
+        """
+        with self._lock:
+            self._ended = True
+        self.journal.close()
+        return self.feeder.finish(str(self._folder / RUN), seconds) if self.feeder is not None else None
+
+
+def _set_aside(folder: Path) -> None:
+    """What an earlier session left keeps its place in the folder, under the next free number."""
+    n = 1
+    while any((folder / name).exists() for name in (f"journal-{n}.db3", f"{RUN}-{n}")):
+        n += 1
+    names = {f"{JOURNAL}{ending}": f"journal-{n}.db3{ending}" for ending in ("", "-wal", "-shm")}
+    for name, kept in {**names, RUN: f"{RUN}-{n}"}.items():
+        try:
+            if (folder / name).exists():
+                (folder / name).rename(folder / kept)
+        except OSError as error:
+            raise BadFile(f"{folder / name}: cannot be set aside: {error.strerror}") from None
