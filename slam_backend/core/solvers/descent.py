@@ -105,8 +105,9 @@ class Descent:
                 self._gauges.add(factor.factor)
         self._options, self._progress = options, progress
         self.values = start
-        self.cost = self._graph.error(start) - self._gauges.error(start)
-        if not isfinite(self.cost):
+        self._error = float(self._graph.error(start))  # with gauges: what is minimized
+        self.cost = self._error - self._gauges.error(start)
+        if not isfinite(self._error):
             raise SolverFailure("the cost of the start is not finite", ())
         self.steps: list[Step] = []
         self.notes: list[str] = []
@@ -134,34 +135,33 @@ class Descent:
 
     def _doubtful(self, stop: str) -> bool:
         damped = self._options.method == "lm" and bool(self.steps) and self.steps[-1].damping > DAMPED
-        return stop in (BOUND, SINGULAR, RISES) or (stop == NO_FALL and damped)
+        return stop in (BOUND, SINGULAR, RISES) or (stop == NO_FALL and damped and self._error >= ZERO)
 
     def _descend(self, method: MethodName) -> str:
         """Until the cost no longer falls. Gauss-Newton may climb on its way."""
-        advance, at, before, worse = self._native(method), self.values, self.cost, 0
-        fell = 0.0
+        advance, at, before, worse, fell = self._native(method), self.values, self._error, 0, 0.0
         bound = gtsam.LevenbergMarquardtParams().getlambdaUpperBound()
-        while len(self.steps) < self._options.iterations:
+        while self._error >= ZERO and len(self.steps) < self._options.iterations:
             if (found := self._iterate(advance, at)) is None:
                 return SINGULAR
-            at, cost = found
-            worse = 0 if cost <= self.cost else worse + 1
-            if worse >= PATIENCE or not isfinite(cost):
+            at, error = found
+            worse = 0 if error <= self._error else worse + 1
+            if worse >= PATIENCE or not isfinite(error):
                 return RISES
-            if cost >= before and method == "lm" and self.steps[-1].damping >= bound:
+            if error >= before and method == "lm" and self.steps[-1].damping >= bound:
                 return BOUND
-            last, fell = fell, before - cost
-            if abs(fell) <= self._options.relative * before or max(before, cost) < ZERO:
+            last, fell = fell, before - error
+            if abs(fell) <= self._options.relative * before:
                 return NO_FALL
-            if self._at_end(last, fell, cost):
+            if self._at_end(last, fell, error):
                 return SETTLED
-            before = cost
-        return LIMIT
+            before = error
+        return LIMIT if self._error >= ZERO else NO_FALL
 
-    def _at_end(self, last: float, fell: float, cost: float) -> bool:
+    def _at_end(self, last: float, fell: float, error: float) -> bool:
         """Whether the cost falls so much faster each time that what is left, by the last two, need not be waited for."""
         quick = 0 < fell < FAST * last and self.steps[-1].damping <= UNDAMPED
-        return quick and fell * fell / last <= REST * self._options.relative * cost
+        return quick and fell * fell / last <= REST * self._options.relative * error
 
     def _settle(self) -> str:
         """Gauss-Newton by the length of its steps. A cost that rises beyond rounding ends it."""
@@ -169,15 +169,15 @@ class Descent:
         advance = self._exact() if planar else self._native("gn")
         at, last, stale = self.values, inf, 0
         while len(self.steps) < self._options.iterations:
-            before = self.cost
+            before = self._error
             if (found := self._iterate(advance, at)) is None:
                 return SINGULAR
-            at, cost = found
+            at, error = found
             length = self.steps[-1].step
-            if not isfinite(cost) or cost - before > self._options.relative * (before + 1):
+            if not isfinite(error) or error - before > self._options.relative * (before + 1):
                 return RISES
             if length < self._options.step:
-                self.values, self.cost = at, cost  # the better by its step, be the cost a rounding higher
+                self._take(at, error)  # the better by its step, be the cost a rounding higher
                 return SMALL_STEP
             stale = stale + 1 if length > SHRINKS * last and length < self._options.relative else 0
             if stale == PATIENCE:
@@ -186,7 +186,7 @@ class Descent:
         return LIMIT
 
     def _iterate(self, advance: Advance, at: gtsam.Values) -> tuple[gtsam.Values, float] | None:
-        """The values and the cost after one iteration, None if the system could not be solved."""
+        """The values and the cost with gauges after one iteration, None if the system could not be solved."""
         try:
             values, error, damping = advance()
         except (RuntimeError, IndexError):  # an indeterminate system; a lost key on the way to it
@@ -195,9 +195,13 @@ class Descent:
         length = float(np.abs(at.localCoordinates(values).vector()).max(initial=0.0))
         self.steps.append(Step(cost, length, damping))
         self._progress(self.steps[-1])
-        if cost < self.cost:
-            self.values, self.cost = values, cost
-        return values, cost
+        if error < self._error:
+            self._take(values, error)
+        return values, error
+
+    def _take(self, values: gtsam.Values, error: float) -> None:
+        self.values, self._error = values, error
+        self.cost = error - float(self._gauges.error(values))
 
     def _native(self, method: MethodName) -> Advance:
         row = METHODS[method]

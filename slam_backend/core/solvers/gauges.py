@@ -53,7 +53,7 @@ def layout(factors: Sequence[Factor], start: gtsam.Values | None = None) -> Layo
     keys, rows = np.unique(touched, return_inverse=True)
     sizes = np.array([len(factor.keys) for factor in factors], dtype=np.int64)
     first = np.repeat(np.cumsum(sizes) - sizes, sizes)  # place of each factor's first key in `touched`
-    part = _connected(len(keys), rows[first], rows)
+    part = connected(len(keys), rows[first], rows)
     idle = np.setdiff1d(np.array(start.keys(), dtype=np.uint64), keys) if start is not None else ()
     return Layout(keys, part, tuple(int(key) for key in idle))
 
@@ -84,7 +84,7 @@ def _first_pose(found: Layout, row: int) -> int:
     return next(int(key) for key in found.keys[found.part == row] if is_pose(int(key)))
 
 
-def _connected(count: int, i: Labels, j: Labels) -> Labels:
+def connected(count: int, i: Labels, j: Labels) -> Labels:
     """(count,) the smallest member of each one's connected part: hook the larger root to the smaller, then jump."""
     label = np.arange(count, dtype=np.int64)
     while True:

@@ -2,7 +2,7 @@
 
 A descent goes wrong where drift has wound the start around: an edge that disagrees with it by nearly half a turn is
 corrected the wrong way, and the descent stops in a wrong place or takes its time. So `auto` takes the file's vertices or
-the odometry where every edge agrees with them within `WOUND`. Else they have a few iterations to settle with no
+the odometry where every edge agrees with them within `WOUND` and `ALONG`. Else they have a few iterations to settle with no
 edge wound; if they do not, the chordal relaxation takes over.
 """
 
@@ -23,10 +23,11 @@ from .batch import Start
 from .chordal import chordal
 from .descent import NO_FALL, SETTLED, Descent, Options, Progress, unwatched
 from .edges import Edges, edges_of, pose_of_matrix, rotations_of, turns
-from .gauges import FIXING, Layout, gauges, layout, space_of
+from .gauges import FIXING, Labels, Layout, connected, gauges, layout, space_of
 
 InitializationName = Literal["auto", "file", "odometry", "chordal"]
-WOUND, UNWOUND = 2.0, 1.0  # rad: of a start, of the end that it led to
+WOUND, ALONG = 2.0, 0.5  # rad: of any edge; of an odometry edge, since turns add up along them
+UNWOUND = 1.0  # rad: of any edge at the end to which a wound start has led
 TRIAL = 8  # iterations
 
 
@@ -42,6 +43,16 @@ class Ground:
     @cached_property
     def edges(self) -> Edges:
         return edges_of(self.factors, self.found, self.space)
+
+    @cached_property
+    def island(self) -> Labels:
+        """(N,) the row of the first pose that edges between poses lead to; landmarks may join islands to one part."""
+        return connected(len(self.found.keys), self.edges.i, self.edges.j)
+
+    @property
+    def roots(self) -> list[int]:
+        """The row of the first pose of each island."""
+        return [row for row in np.unique(self.island).tolist() if is_pose(self.keys[row])]
 
     @property
     def states_all(self) -> bool:
@@ -82,12 +93,13 @@ def _chosen(ground: Ground, options: Options, progress: Progress) -> Start:
     tried = []
     for name in ("file", "odometry") if ground.states_all else ("odometry",):
         start = _from(name, ground)
-        if (wound := _wound(ground, start.values)) < WOUND:
-            return replace(start, why=f"no edge disagrees with it by more than {wound:.2g} rad")
+        along, worst = _wound(ground, start.values)
+        if along < ALONG and worst < WOUND:
+            return replace(start, why=f"no edge disagrees with it by more than {worst:.2g} rad")
         tried.append((cost_of(ground.factors, start.values), start))
     nearest = min(tried, key=lambda pair: pair[0])[1]
     ahead, cost = _advanced(nearest, ground, options, progress)
-    if ahead.settled and _wound(ground, ahead.values) < UNWOUND:
+    if ahead.settled and _wound(ground, ahead.values)[1] < UNWOUND:
         return replace(ahead, why=f"settled within {TRIAL} iterations")
     start = _from("chordal", ground)
     if (of_chordal := cost_of(ground.factors, start.values)) < cost:
@@ -117,10 +129,11 @@ def _advanced(start: Start, ground: Ground, options: Options, progress: Progress
     return ahead, descent.cost
 
 
-def _wound(ground: Ground, values: gtsam.Values) -> float:
-    """The angle (rad) by which the worst edge disagrees with the values."""
-    rotations = rotations_of(ground.space, values, ground.found)
-    return float(turns(ground.edges, rotations).max(initial=0.0))
+def _wound(ground: Ground, values: gtsam.Values) -> tuple[float, float]:
+    """The angles (rad) by which odometry, and by which any edge, disagrees with the values at worst."""
+    angles = turns(ground.edges, rotations_of(ground.space, values, ground.found))
+    along = angles[np.array(ground.edges.motion, dtype=bool)]
+    return float(along.max(initial=0.0)), float(angles.max(initial=0.0))
 
 
 def _stated(ground: Ground) -> gtsam.Values:
@@ -134,7 +147,7 @@ def _stated(ground: Ground) -> gtsam.Values:
 def _odometry(ground: Ground) -> gtsam.Values:
     """Along odometry edges as far as they lead, then over as few others as possible: a search in which odometry is free."""
     edges = ground.edges
-    poses: dict[int, Pose] = dict.fromkeys(np.unique(ground.found.part).tolist(), ground.space.identity)
+    poses: dict[int, Pose] = dict.fromkeys(ground.roots, ground.space.identity)
     beside: list[list[tuple[int, int]]] = [[] for _ in ground.found.keys]  # (edge, other end)
     for edge, (i, j) in enumerate(zip(edges.i.tolist(), edges.j.tolist(), strict=True)):
         beside[i].append((edge, j))
@@ -156,7 +169,7 @@ def _odometry(ground: Ground) -> gtsam.Values:
 
 
 def _chordal(ground: Ground) -> gtsam.Values:
-    rotations, translations = chordal(ground.edges, np.unique(ground.found.part), len(ground.found.keys))
+    rotations, translations = chordal(ground.edges, np.array(ground.roots), len(ground.keys))
     poses = {
         row: pose_of_matrix(ground.space, rotation, translation)
         for row, (rotation, translation) in enumerate(zip(rotations, translations, strict=True))
@@ -172,19 +185,20 @@ INITIALIZATIONS: Mapping[str, Callable[[Ground], gtsam.Values]] = {
 
 
 def _anchored(poses: Mapping[int, Pose], ground: Ground) -> gtsam.Values:
-    """Each part moved to what holds it in space, else to where the file states its first pose."""
+    """Each island moved to what holds it in space, else to where the file states its first pose."""
     shift: dict[int, Pose] = {}
     fixing = [factor for factor in ground.factors if factor.kind in FIXING]
     for row, factor in zip(ground.found.rows([f.keys[0] for f in fixing]).tolist(), fixing, strict=True):
-        if (part := int(ground.found.part[row])) not in shift:
-            shift[part] = factor.factor.prior().compose(poses[row].inverse())
-    for part, root in zip(np.unique(ground.found.part).tolist(), ground.found.roots, strict=True):
-        if part not in shift and ground.stated.exists(root):
-            shift[part] = ground.space.pose_in(ground.stated, root).compose(poses[part].inverse())
+        if (island := int(ground.island[row])) not in shift:
+            shift[island] = factor.factor.prior().compose(poses[row].inverse())
+    for root in ground.roots:
+        if root not in shift and ground.stated.exists(ground.keys[root]):
+            stated = ground.space.pose_in(ground.stated, ground.keys[root])
+            shift[root] = stated.compose(poses[root].inverse())
     values = gtsam.Values()
-    for row, (key, part) in enumerate(zip(ground.keys, ground.found.part.tolist(), strict=True)):
+    for row, (key, island) in enumerate(zip(ground.keys, ground.island.tolist(), strict=True)):
         if is_pose(key):
-            values.insert(key, shift[part].compose(poses[row]) if part in shift else poses[row])
+            values.insert(key, shift[island].compose(poses[row]) if island in shift else poses[row])
     return values
 
 
