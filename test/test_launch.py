@@ -6,6 +6,7 @@ import os
 import re
 import subprocess
 import sys
+from array import array
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,7 +16,7 @@ from typing import Any
 import pytest
 import yaml
 
-from slam_backend.core.config import Config, config_to
+from slam_backend.core.config import Config, config_from, config_to
 from slam_backend.io.configfile import load_config
 
 ROOT = Path(__file__).parents[1]
@@ -152,18 +153,33 @@ def test_a_configuration_says_only_what_differs(path: Path) -> None:
 def test_a_configuration_is_a_params_file_too(path: Path) -> None:
     """For a node of any name; read by rclpy it is what `replay` reads."""
     rclpy = pytest.importorskip("rclpy")
-    from slam_backend.ros.parameters import config_of
-
     context = rclpy.Context()
     rclpy.init(args=["node", "--ros-args", "--params-file", str(path)], context=context)
     try:
         node = rclpy.create_node(
             "any", namespace="/r1", context=context, automatically_declare_parameters_from_overrides=True
         )
-        assert config_of(node) == load_config(path)
+        given = {name: each.value for name, each in node.get_parameters_by_prefix("").items()}
         node.destroy_node()
     finally:
         rclpy.try_shutdown(context=context)
+    assert config_from(nested(given)) == load_config(path)
+
+
+def nested(parameters: Mapping[str, Any]) -> dict[str, Any]:
+    """`wheels.kind` of a node as `wheels: {kind: ...}`, without rclpy's own parameters."""
+    found: dict[str, Any] = {}
+    for name, value in parameters.items():
+        *path, leaf = name.split(".")
+        section = found
+        for part in path:
+            section = section.setdefault(part, {})
+        section[leaf] = list(value) if isinstance(value, array) else value
+    return {
+        name: value
+        for name, value in found.items()
+        if name not in ("use_sim_time", "start_type_description_service")
+    }
 
 
 def rviz_topics() -> dict[str, str]:

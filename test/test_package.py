@@ -93,8 +93,9 @@ def test_pip_installs_script_and_ament_files(tmp_path: Path) -> None:
     pip = [sys.executable, "-m", "pip"]
     subprocess.run([*pip, "wheel", "-q", "--no-deps", "-w", built, copied(tmp_path)], check=True)
     (wheel,) = built.glob("*.whl")
-    subprocess.run([*pip, "install", "-q", "--no-deps", "--prefix", tmp_path / "prefix", wheel], check=True)
     prefix = tmp_path / "prefix"
+    into = ["--ignore-installed", "--prefix", prefix]  # otherwise pip removes the one that runs this test
+    subprocess.run([*pip, "install", "-q", "--no-deps", *into, wheel], check=True)
     assert (prefix / "bin" / "slam-backend").exists()
     assert (prefix / "share/ament_index/resource_index/packages/slam_backend").exists()
     assert (prefix / "share/slam_backend/package.xml").exists()

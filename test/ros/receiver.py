@@ -1,4 +1,4 @@
-"""Counts what it gets, byte for byte: `receiver.py DEPTH TOPIC TYPE ...`. Says `ready`, and at its end one line of JSON.
+"""Counts what it gets, byte for byte: `receiver.py DEPTH TOPIC TYPE ...`. Says `ready`, `first of TOPIC`, and at its end one line of JSON.
 
 The line: topic -> [number of messages, SHA-256 over their bytes in order of arrival, the first, the last (hex)].
 """
@@ -18,9 +18,15 @@ def receive(node, topic, kind, depth):
     latched = topic.endswith("/tf_static")
     durability = DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE
     got = []
+
+    def take(message):
+        if not got:
+            sys.stdout.write(f"first of {topic}\n")
+        got.append(message)
+
     message_class = getattr(import_module(f"{package}.msg"), name)
     node.create_subscription(
-        message_class, topic, got.append, QoSProfile(depth=depth, durability=durability), raw=True
+        message_class, topic, take, QoSProfile(depth=depth, durability=durability), raw=True
     )
     return got
 
