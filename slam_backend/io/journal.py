@@ -34,6 +34,7 @@ CREATE TABLE IF NOT EXISTS messages(id INTEGER PRIMARY KEY, topic_id INTEGER NOT
     data BLOB NOT NULL);
 CREATE INDEX IF NOT EXISTS timestamp_idx ON messages(timestamp ASC);
 """
+UNANNOUNCE = "DELETE FROM topics WHERE name = ? AND id NOT IN (SELECT DISTINCT topic_id FROM messages)"
 
 
 class Row(NamedTuple):
@@ -57,6 +58,7 @@ class Journal:
         self.trouble = ""
         self._failed = failed
         self._queue: deque[tuple[str, str, int, bytes]] = deque()
+        self._announced: dict[str, str] = {}
         self._arrival = threading.Lock()
         self._wake, self._stop = threading.Event(), threading.Event()
         self._grown = threading.Condition()
@@ -93,6 +95,11 @@ class Journal:
         self._wake.set()
         return True
 
+    def announce(self, topics: Mapping[str, str]) -> None:
+        """Topics, and a type of each, that are listened to, so that a reader finds them though nothing came."""
+        self._announced |= topics
+        self._wake.set()
+
     def wait(self, after: int, timeout: float, unless: Callable[[], bool] = lambda: False) -> bool:
         """Until there are rows beyond `after` or, after a nudge, something else is true, or the timeout (s) has passed."""
         with self._grown:
@@ -112,16 +119,14 @@ class Journal:
 
     def _write(self) -> None:
         database = self._database
-        topics = {
-            (name, type_): id_ for id_, name, type_ in database.execute("SELECT id, name, type FROM topics")
-        }
+        topics = _topics(database)
         while not (self._stop.is_set() and not self._queue):
             self._wake.wait()
             self._wake.clear()
             self._stop.wait(COMMIT_DELAY)
             batch = [self._queue[n] for n in range(len(self._queue))]  # they stay until they are in the file
             try:
-                topics |= self._commit(database, topics, batch)
+                topics = self._commit(database, topics, batch)
                 self.trouble = ""
             except sqlite3.Error as error:
                 news, self.trouble = not self.trouble, f"{self.path}: cannot be written: {error}"
@@ -142,13 +147,16 @@ class Journal:
         topics: Mapping[tuple[str, str], int],
         batch: Sequence[tuple[str, str, int, bytes]],
     ) -> dict[tuple[str, str], int]:
-        """All or nothing; the ids of topics that were new."""
-        new: dict[tuple[str, str], int] = {}
+        """All or nothing; the ids of the topics that the file has then."""
+        known, announced = dict(topics), dict(self._announced)
         with database:
-            for name, type_, _, _ in batch:
-                if (name, type_) not in topics and (name, type_) not in new:
-                    new[name, type_] = _add_topic(database, name, type_)
-            known = {**topics, **new}
+            for name, type_ in dict.fromkeys((name, type_) for name, type_, _, _ in batch):
+                if (name, type_) not in known:
+                    database.execute(UNANNOUNCE, (name,))
+                    known = _topics(database) | {(name, type_): _add_topic(database, name, type_)}
+            for name, type_ in announced.items():
+                if not any(name == there for there, _ in known):
+                    known[name, type_] = _add_topic(database, name, type_)
             rows = [(known[name, type_], stamp, data) for name, type_, stamp, data in batch]
             database.executemany("INSERT INTO messages(topic_id, timestamp, data) VALUES (?, ?, ?)", rows)
         for _ in batch:
@@ -156,7 +164,7 @@ class Journal:
         with self._grown:
             self.committed += len(batch)
             self._grown.notify_all()
-        return new
+        return known
 
 
 class JournalReader:
@@ -185,6 +193,10 @@ def _connect(path: Path, mode: str) -> sqlite3.Connection:
     database.execute("PRAGMA journal_mode=WAL")
     database.execute("PRAGMA synchronous=NORMAL")
     return database
+
+
+def _topics(database: sqlite3.Connection) -> dict[tuple[str, str], int]:
+    return {(name, type_): id_ for id_, name, type_ in database.execute("SELECT id, name, type FROM topics")}
 
 
 def _add_topic(database: sqlite3.Connection, name: str, type_: str) -> int:

@@ -48,6 +48,7 @@ from .state import State
 LOOK = 0.3  # s between two looks at the graph
 BEAT = 0.1  # s within which a signal is heard
 JUMP = SECOND  # ns that the driving source must go back for its clock to have jumped
+DOUBTFUL = 10_000  # messages at most that are kept in case its clock has jumped
 WATCHED = ("path", "trajectory", "landmarks", "graph")  # outputs that are made from a snapshot
 FAREWELL = 30.0  # s that the worker may take to flush and save at the end
 DEFAULT_ODOM = Config().odom_frame
@@ -103,7 +104,12 @@ class BackendNode(LifecycleNode):
         self._refresh = threading.Event()
         self._session: Session | None = None
         self._early: deque[tuple[str, str, bytes]] = deque(maxlen=LIMIT)  # heard between two sessions
-        self._doubtful: list[tuple[str, str, bytes]] = []  # it went back in time; the next one tells
+        self._doubtful: list[
+            tuple[str, str, bytes]
+        ] = []  # since the odometry went back in time; its next one tells
+        self._static: dict[
+            bytes, str
+        ] = {}  # what came on /tf_static, and its type: it comes once, and is for every session
         self._finder: Finder | None = None  # where no sources are configured
         self._inputs: Inputs | None = None
         self._outputs: Outputs | None = None
@@ -130,6 +136,7 @@ class BackendNode(LifecycleNode):
         self._closed = threading.Event()
         self.state.clear()
         self._early.clear()
+        self._static.clear()
         self.config = self._given
         self._finder = None if self._given.sources else Finder(self._typestore)
         frames = self.config.map_frame, self.config.odom_frame, self.config.base_frame or "base_link"
@@ -228,6 +235,8 @@ class BackendNode(LifecycleNode):
     def _opened(self) -> Session:
         """Journal and worker. BadFile where the data directory cannot be used."""
         session = Session(self.data_dir, self.state, self.incident)
+        for data, type_ in self._static.items():
+            session.journal.append(TF_STATIC, type_, data)
         if self.config.sources:
             self._work(session, self.config)
         return session
@@ -252,7 +261,7 @@ class BackendNode(LifecycleNode):
         self.get_logger().info(
             f"saved {folder}: run hash {summary['run_hash'][:16]}"
             if summary
-            else "no source was heard: there is no run to save"
+            else "nothing was heard: there is no run to save"
         )
 
     def _feeder(self) -> Feeder | None:
@@ -290,9 +299,15 @@ class BackendNode(LifecycleNode):
         odometry = self._odometry_in(record)
         for item in odometry:
             if self._odometer.jumped_back(item.stamp, JUMP) and self._begins_anew(item.source):
-                self._early.extendleft([(topic, type_, data), *self._doubtful])
+                self._early.extendleft(reversed([*self._doubtful, (topic, type_, data)]))
+                self._doubtful = []
                 return
-            self._doubtful = [(topic, type_, data)] if self._odometer.doubts else []
+        if self._odometer.doubts and len(self._doubtful) < DOUBTFUL:
+            self._doubtful.append((topic, type_, data))
+        elif odometry:
+            self._doubtful = []
+        if topic == TF_STATIC:
+            self._static[data] = type_
         of_other_frames = type_ == TRANSFORMS and topic in self._driving and not odometry
         if not of_other_frames and not session.journal.append(topic, type_, data):
             self._early.appendleft((topic, type_, data))  # the session has just ended

@@ -7,6 +7,7 @@ from typing import Any
 
 from ..core.config import Config
 from ..core.errors import BadFile
+from ..core.sensors import SENSORS
 from ..io.feeder import Feeder
 from ..io.inputs import TF_STATIC
 from ..io.journal import NAME as JOURNAL
@@ -36,18 +37,29 @@ class Session:
                 return
             if self.feeder is not None:
                 self.feeder.close()
+            self.journal.announce(
+                {
+                    source.topic: next(iter(SENSORS[source.kind].decoders))
+                    for source in config.sources.values()
+                }
+            )
             self._state.expect(self.journal.committed)
             self.feeder = Feeder(self.journal, config, table, self._state.take, self._incident)
 
     def end(self, seconds: float) -> Any:
-        """Close the journal, let the worker read it to its end and save; the run's summary, None without a worker.
+        """Close the journal, let the worker read it to its end and save; the run's summary, None if nothing was heard.
 
         SlamError if that did not work, or not in time (s).
         """
         with self._lock:
             self._ended = True
         self.journal.close()
-        return self.feeder.finish(str(self._folder / RUN), seconds) if self.feeder is not None else None
+        if self.feeder is None:
+            return None
+        if not self.journal.committed:
+            self.feeder.close()
+            return None
+        return self.feeder.finish(str(self._folder / RUN), seconds)
 
 
 def _set_aside(folder: Path) -> None:

@@ -112,6 +112,22 @@ def test_it_is_an_ordinary_bag_of_one_file(journal) -> None:
     assert "geometry_msgs/PoseWithCovariance pose" in text[0]
 
 
+def test_a_topic_on_which_nothing_came_is_there(journal) -> None:
+    """With the type that was announced, or with that of the first message."""
+    journal.announce({"/loops": ODOMETRY, "/tags": ODOMETRY, "/odom": ODOMETRY})
+    until(lambda: len(sqlite3.connect(journal.path).execute("SELECT * FROM topics").fetchall()) == 3)
+    journal.append("/odom", ODOMETRY, message(0))
+    journal.append("/tags", "sensor_msgs/msg/PointCloud2", b"")
+    journal.append("/odom", ODOMETRY, message(1))
+    journal.close()
+    with open_bag(journal.path) as bag:
+        assert {name: (topic.type, topic.count) for name, topic in bag.topics.items()} == {
+            "/loops": (ODOMETRY, 0),
+            "/odom": (ODOMETRY, 2),
+            "/tags": ("sensor_msgs/msg/PointCloud2", 1),
+        }
+
+
 def test_opened_again_it_goes_on(journal, tmp_path, complaints) -> None:
     """Ids and log times continue, topics keep their rows."""
     journal.append("/odom", ODOMETRY, message(0))

@@ -3,14 +3,17 @@
 A test here runs only where rclpy is installed; a module that imports it on top begins with `pytest.importorskip("rclpy")`.
 """
 
+import json
 import os
 import signal
 import subprocess
 import sys
 import time
 from contextlib import suppress
+from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
+from typing import NamedTuple
 
 import pytest
 
@@ -134,3 +137,197 @@ def context():
     rclpy.init(context=context)
     yield context
     rclpy.try_shutdown(context=context)
+
+
+class Peer:
+    """A node of the test's own process: publishes bytes, keeps what it hears, calls services."""
+
+    def __init__(self, context):
+        import rclpy
+        from rclpy.executors import SingleThreadedExecutor
+
+        self.node = rclpy.create_node("peer", context=context)
+        self._executor = SingleThreadedExecutor(context=context)
+        self._executor.add_node(self.node)
+
+    def spin(self, seconds):
+        end = time.monotonic() + seconds
+        while (left := end - time.monotonic()) > 0:
+            self._executor.spin_once(timeout_sec=min(left, 0.02))
+
+    def until(self, condition, seconds=20.0, *, why=lambda: ""):
+        """Spin until it is so; fails if it is not in time."""
+        end = time.monotonic() + seconds
+        while not (found := condition()):
+            assert time.monotonic() < end, f"it was not so in {seconds} s; {why()}"
+            self._executor.spin_once(timeout_sec=0.02)
+        return found
+
+    def publisher(self, topic, type_, *, reliable=True, latched=False, depth=2000):
+        from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+
+        profile = QoSProfile(
+            depth=depth,
+            reliability=ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT,
+            durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
+        )
+        return self.node.create_publisher(_class_of(type_), topic, profile)
+
+    def hear(self, topic, type_, *, latched=False):
+        """A list that fills with the messages of a topic."""
+        from rclpy.qos import DurabilityPolicy, QoSProfile
+
+        heard = []
+        durability = DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE
+        profile = QoSProfile(depth=2000, durability=durability)
+        self.node.create_subscription(_class_of(type_), topic, heard.append, profile)
+        return heard
+
+    def call(self, type_, service, request=None, seconds=20.0):
+        client = self.node.create_client(type_, service)
+        assert client.wait_for_service(seconds), f"there is no service {service}"
+        future = client.call_async(request or type_.Request())
+        self.until(future.done, seconds)
+        self.node.destroy_client(client)
+        return future.result()
+
+    def play(self, records, rate=0.0, extra=(), settle=0.5):
+        """Publish records once the node listens to all their topics; rate: times the log times, 0: 1,000 a second.
+
+        extra: (number of a record, called before it) pairs.
+        """
+        records, acts = list(records), dict(extra)
+        topics = {record.topic: record.type for record in records}
+        publishers = {t: self.publisher(t, k, latched=t.endswith("tf_static")) for t, k in topics.items()}
+        self.until(lambda: all(p.get_subscription_count() for p in publishers.values()))
+        self.spin(settle)
+        begin = time.monotonic()
+        for n, record in enumerate(records):
+            if n in acts:
+                acts[n]()
+            due = n / 1000 if rate == 0 else (record.log_time - records[0].log_time) / 1e9 / rate
+            if (left := begin + due - time.monotonic()) > 0:
+                self.spin(left)
+            publishers[record.topic].publish(bytes(record.data))
+        for publisher in publishers.values():
+            publisher.wait_for_all_acked()
+        return publishers
+
+
+def _class_of(type_):
+    package, _, name = type_.split("/")
+    return getattr(import_module(f"{package}.msg"), name)
+
+
+@pytest.fixture
+def peer(context):
+    peer = Peer(context)
+    yield peer
+    peer.node.destroy_node()
+
+
+def gone(pids, seconds=1.0):
+    """Whether these processes end by themselves in time; one that nobody has buried yet has ended."""
+
+    def lives(pid):
+        with suppress(OSError):
+            return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+        return False
+
+    end = time.monotonic() + seconds
+    while any(map(lives, pids)):
+        if time.monotonic() > end:
+            return False
+        time.sleep(0.02)
+    return True
+
+
+class Backend:
+    """The node as a process. folder: its data_dir; name: with its namespace."""
+
+    def __init__(self, start, folder, config, arguments, settings, namespace):
+        self.folder, self.name = folder, f"{namespace}/slam_backend"
+        words = ["run", "--data-dir", folder]
+        words += ["--config", config] if config else []
+        words += ["--namespace", namespace] if namespace else []
+        words += [word for setting in settings for word in ("--set", setting)]
+        self.process = start("-m", "slam_backend", *words, "--", *arguments)
+
+    @property
+    def children(self):
+        """Command lines of its processes, by pid."""
+        pid, found = self.process.pid, {}
+        for task in Path(f"/proc/{pid}/task").glob("*/children"):
+            with suppress(OSError):
+                for child in task.read_text().split():
+                    found[int(child)] = Path(f"/proc/{child}/cmdline").read_text().replace("\0", " ")
+        return found
+
+    def worker(self, seconds=10.0):
+        """The pid of the process that solves."""
+        end = time.monotonic() + seconds
+        while time.monotonic() < end:
+            for pid, command in self.children.items():
+                with suppress(OSError):
+                    maps = Path(f"/proc/{pid}/maps").read_text()
+                    if "spawn_main" in command and "gtsam" in maps and "_rclpy" not in maps:
+                        return pid
+            time.sleep(0.05)
+        raise AssertionError(f"there is no worker:\n{self.process.output}")
+
+    def end(self, number=signal.SIGINT, seconds=20.0):
+        """Its summary; it must end well, leave nobody behind and print no traceback."""
+        children = self.children
+        self.process.signal(number)
+        code = self.process.wait(seconds)
+        assert code == 0, self.process.output
+        assert "Traceback" not in self.process.output, self.process.output
+        assert "Failed to publish" not in self.process.output, self.process.output
+        assert gone(children)
+        return self.summary
+
+    def is_alone(self, pids):
+        """Whether none of these processes of its outlived it."""
+        return gone(pids)
+
+    @property
+    def summary(self):
+        return json.loads((self.folder / "run" / "summary.json").read_text())
+
+    def replayed(self, session=""):
+        """What replay makes of the journal with the configuration that the run was saved with."""
+        import slam_backend as sb
+
+        config = sb.load_config(self.folder / f"run{session}" / "config.yaml")
+        return sb.replay(self.folder / f"journal{session}.db3", config).result.summary
+
+
+@pytest.fixture
+def backend(start, tmp_path):
+    """`backend(config, ...)`: a node that is about to listen."""
+
+    def begin(config=None, *arguments, settings=(), namespace="", data="data"):
+        return Backend(start, tmp_path / data, config, arguments, settings, namespace)
+
+    return begin
+
+
+class Drive(NamedTuple):
+    bag: Path
+    config: Path
+    records: list
+
+
+@pytest.fixture(scope="session")
+def drive(tmp_path_factory):
+    """A minute of a simulated drive with loops, landmarks and a camera's mount: bag, configuration, records."""
+    from slam_backend.io.bags import open_bag
+    from slam_backend.lab.simulate import Options, simulate, write_simulation
+
+    folder = tmp_path_factory.mktemp("drive")
+    written = write_simulation(
+        simulate("warehouse", 2, Options(poses=600, loop_rate=0.3)), folder / "drive.mcap"
+    )
+    with open_bag(written.bag) as bag:
+        records = [record for record in bag.records() if record.topic != "/truth"]
+    return Drive(written.bag, written.config, records)

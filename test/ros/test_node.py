@@ -1,0 +1,117 @@
+"""The node over DDS, between processes: what runs live is what replay computes, whoever stops or dies meanwhile."""
+
+import os
+import signal
+import time
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("rclpy")
+
+import slam_backend as sb
+
+WAREHOUSE = Path(__file__).parents[2] / "bags" / "warehouse.mcap"
+ODOMETRY = "nav_msgs/msg/Odometry"
+
+
+def replayed(drive):
+    return sb.replay(drive.bag, sb.load_config(drive.config)).result.summary
+
+
+def stopped(pid, seconds):
+    """Stop a process for a while, in the midst of what it does."""
+
+    def act():
+        os.kill(pid(), signal.SIGSTOP)
+        time.sleep(seconds)
+        os.kill(pid(), signal.SIGCONT)
+
+    return act
+
+
+def test_what_runs_live_is_what_replay_computes(backend, peer, drive) -> None:
+    """At ten times its speed, undisturbed: the hash is that of the journal's replay, and of the bag's."""
+    node = backend(drive.config)
+    begin = time.monotonic()
+    pose = peer.hear("/slam_backend/pose", "geometry_msgs/msg/PoseWithCovarianceStamped")
+    peer.play(drive.records, rate=10)
+    assert pose
+    summary = node.end()
+    assert time.monotonic() - begin < 30
+    assert summary["counts"]["records"] == len(drive.records)
+    assert summary["run_hash"] == node.replayed()["run_hash"] == replayed(drive)["run_hash"]
+    assert node.process.output.count("[ERROR]") == 0
+
+
+def test_stops_and_deaths_lose_nothing(backend, peer, drive) -> None:
+    """The node stands still for a second, then its worker, then the worker is killed."""
+    node = backend(drive.config)
+    third = len(drive.records) // 4
+    acts = {
+        third: stopped(lambda: node.process.pid, 1),
+        2 * third: stopped(node.worker, 1),
+        3 * third: lambda: os.kill(node.worker(), signal.SIGKILL),
+    }
+    peer.play(drive.records, rate=10, extra=acts.items())
+    node.process.wait_for("the worker was lost (it ended with code -9)")
+    summary = node.end()
+    assert summary["counts"]["records"] == len(drive.records)
+    assert summary["run_hash"] == node.replayed()["run_hash"] == replayed(drive)["run_hash"]
+
+
+@pytest.mark.parametrize(
+    "numbers",
+    [[signal.SIGINT], [signal.SIGTERM], [signal.SIGINT, signal.SIGINT], [signal.SIGTERM, signal.SIGINT]],
+)
+def test_a_signal_ends_it_with_the_run_saved(backend, peer, drive, numbers) -> None:
+    """Within two seconds for a small graph; a second signal does not tear the saving."""
+    node = backend(drive.config)
+    peer.play(drive.records[:150])
+    begin = time.monotonic()
+    for number in numbers[:-1]:
+        node.process.signal(number)
+        time.sleep(0.02)
+    summary = node.end(numbers[-1])
+    assert time.monotonic() - begin < 2
+    assert summary["run_hash"] == node.replayed()["run_hash"]
+    assert "run hash" in node.process.output
+
+
+@pytest.mark.parametrize("moment", [0.0, 0.3, 0.6, 1.0])
+def test_a_signal_while_it_starts_ends_it_too(backend, drive, moment) -> None:
+    """Wherever it is then: no traceback of its own or of its processes, nobody left behind."""
+    node = backend(drive.config)
+    time.sleep(moment)
+    children = node.children
+    node.process.signal(signal.SIGINT)
+    assert node.process.wait(10) in (0, 130, -2), node.process.output
+    if moment:
+        assert "Traceback" not in node.process.output
+    assert node.is_alone(children)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("trouble", ["none", "node stopped", "worker stopped", "worker killed"])
+def test_the_warehouse_at_five_times_its_speed(backend, start, trouble) -> None:
+    """The bag that ships with the package, by the package's own player, with three seconds of trouble in its midst."""
+    config = WAREHOUSE.with_suffix(".yaml")
+    node = backend(config)
+    player = start(
+        "-m", "slam_backend", "play", WAREHOUSE, "--rate", 5, "--depth", 2000, "--wait", 20, "--json",
+        "--topics", "/odom,/loops,/landmarks,/tf_static", seconds=200,
+    )  # fmt: skip
+    node.process.wait_for("listening to /odom")
+    time.sleep(50)
+    match trouble:
+        case "node stopped":
+            stopped(lambda: node.process.pid, 3)()
+        case "worker stopped":
+            stopped(node.worker, 3)()
+        case "worker killed":
+            os.kill(node.worker(), signal.SIGKILL)
+    assert player.wait(150) == 0
+    summary = node.end(seconds=60)
+    live, offline = summary, sb.replay(WAREHOUSE, sb.load_config(config)).result.summary
+    assert live["counts"]["records"] == offline["counts"]["records"]
+    assert live["run_hash"] == node.replayed()["run_hash"] == offline["run_hash"]
