@@ -11,9 +11,10 @@ In YAML the sources are named in a list and described at the top level, so that 
 import hashlib
 import json
 from collections.abc import Mapping
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, get_args
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic.fields import FieldInfo
 
 from .errors import BadConfig
 
@@ -235,6 +236,12 @@ def config_to(config: Config) -> dict[str, Any]:
     data = config.model_dump(mode="json")
     sources = data.pop("sources")
     return {**data, "sources": list(sources), **sources}
+
+
+def words_of(field: FieldInfo) -> tuple[str, ...]:
+    """The words that a setting may be; none for one that is not a choice."""
+    parts = (field.annotation, *get_args(field.annotation))
+    return tuple(dict.fromkeys(word for part in parts for word in get_args(part) if isinstance(word, str)))
 
 
 def config_hash(config: Config) -> str:

@@ -7,7 +7,7 @@ from typing import Any, get_args
 from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 
-from ..core.config import AnySource, Config
+from ..core.config import AnySource, Config, words_of
 
 HEAD = """# Settings
 
@@ -60,14 +60,8 @@ def _default(field: FieldInfo) -> str:
 
 def _range(field: FieldInfo) -> str:
     """Bounds, or the words that may stand there."""
-    words = [
-        word
-        for part in (field.annotation, *get_args(field.annotation))
-        for word in get_args(part)
-        if isinstance(word, str)
-    ]
-    if words:
-        return ", ".join(dict.fromkeys(words))
+    if words := words_of(field):
+        return ", ".join(words)
     signs = {"gt": ">", "ge": "≥", "lt": "<", "le": "≤"}
     bounds = [
         f"{sign} {value:g}"

@@ -11,7 +11,7 @@ from rclpy.exceptions import ParameterAlreadyDeclaredException
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
-from ..core.config import AnySource, Config, config_from, config_to
+from ..core.config import AnySource, Config, config_from, config_to, words_of
 from ..core.errors import BadConfig
 
 FOREIGN = ("use_sim_time", "qos_overrides", "start_type_description_service")  # rclpy's own parameters
@@ -112,14 +112,8 @@ def _descriptor(field: FieldInfo | None) -> ParameterDescriptor:
     extra = field.json_schema_extra
     descriptor.read_only = not (isinstance(extra, dict) and extra.get("live"))
     descriptor.description = field.description or ""
-    words = [
-        word
-        for part in (field.annotation, *get_args(field.annotation))
-        for word in get_args(part)
-        if isinstance(word, str)
-    ]
-    if words:
-        descriptor.additional_constraints = f"one of {', '.join(dict.fromkeys(words))}"
+    if words := words_of(field):
+        descriptor.additional_constraints = f"one of {', '.join(words)}"
     low, high = _bound(field, "gt", "ge"), _bound(field, "lt", "le")
     if low is None and high is None:
         return descriptor
