@@ -99,6 +99,10 @@ def _all_verbs() -> Any:
 
 def _explain(error: BaseException, arguments: list[str]) -> tuple[str, int]:
     """The line and the exit code for what went wrong."""
+    if isinstance(
+        error.__context__, KeyboardInterrupt
+    ):  # Ctrl-C in the middle of an import: what follows is its echo
+        error = error.__context__
     match error:
         case SlamError():
             return _one_line(str(error)), 2
@@ -108,6 +112,8 @@ def _explain(error: BaseException, arguments: list[str]) -> tuple[str, int]:
             return f"{said} (see {' '.join(words)})", 2
         case typer.Abort() | KeyboardInterrupt():
             return "interrupted", 130
+        case MemoryError():
+            return f"not enough memory: {_one_line(str(error))}", 2
         case OSError():  # no permission, disk full, a directory where a file should be
             return ": ".join(str(part) for part in (error.filename, error.strerror or error) if part), 2
     hint = f"; run with {TRACEBACK}=1 for the traceback"

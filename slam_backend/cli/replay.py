@@ -37,7 +37,7 @@ def command(
     """Replay recorded logs through the same core as the live node, and write a run directory."""
     from ..io.configfile import load_config
     from ..io.replay import replay
-    from ..io.rundir import prepare, write_run
+    from ..io.rundir import PICTURE, prepare, write_run
     from ..lab.picture import draw
 
     target = out or Path("runs") / inputs[0].stem
@@ -45,7 +45,7 @@ def command(
     run = replay(inputs, load_config(config) if config else None, settings or (), final)
     _watch(run)
     write_run(run.result, target)
-    draw(run.result, target / "trajectory.png")
+    draw(run.result, target / PICTURE)
     if as_json:
         typer.echo(json.dumps(run.result.summary))
     else:

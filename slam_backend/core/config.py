@@ -39,6 +39,8 @@ class Keyframes(Section):
 
 
 class Settle(Section):
+    """Measurements are put in the order of their stamps before they are used."""
+
     lag: float = Field(
         0.2, ge=0, le=60, description="seconds that a measurement waits for others with older stamps"
     )
@@ -50,7 +52,9 @@ class Isam2(Section):
     relinearize_threshold: float = Field(
         0.1, gt=0, description="change of a variable (m, rad) that relinearizes it"
     )
-    relinearize_skip: int = Field(10, ge=1, description="updates between two looks at that threshold")
+    relinearize_skip: int = Field(
+        10, ge=1, le=1_000_000, description="updates between two looks at that threshold"
+    )
     wildfire_threshold: float = Field(
         1e-4, ge=0, description="change (m, rad) below which an update is not carried on to older variables"
     )
@@ -100,22 +104,22 @@ class OdometrySource(Source):
         description="model: the sigmas below; twist: integrated twist covariance; pose: difference of pose covariances",
     )
     sigma_translation_per_meter: float = Field(
-        0.05, ge=0, description="m after 1 m of path; grows with its square root"
+        0.05, ge=0, le=1e6, description="m after 1 m of path; grows with its square root"
     )
     sigma_translation_per_radian: float = Field(
-        0.02, ge=0, description="m after 1 rad turned; grows with its square root"
+        0.02, ge=0, le=1e6, description="m after 1 rad turned; grows with its square root"
     )
     sigma_rotation_per_meter: float = Field(
-        0.01, ge=0, description="rad after 1 m of path; grows with its square root"
+        0.01, ge=0, le=1e6, description="rad after 1 m of path; grows with its square root"
     )
     sigma_rotation_per_radian: float = Field(
-        0.05, ge=0, description="rad after 1 rad turned; grows with its square root"
+        0.05, ge=0, le=1e6, description="rad after 1 rad turned; grows with its square root"
     )
     sigma_translation_floor: float = Field(
-        0.002, gt=0, description="m, added to every edge between keyframes"
+        0.002, gt=0, le=1e6, description="m, added to every edge between keyframes"
     )
     sigma_rotation_floor: float = Field(
-        0.0005, gt=0, description="rad, added to every edge between keyframes"
+        0.0005, gt=0, le=1e6, description="rad, added to every edge between keyframes"
     )
     max_speed: float = Field(100.0, gt=0, description="m/s; a faster step is a teleport and is refused")
 
@@ -124,25 +128,37 @@ class RelativeSource(Observing):
     """Pose of one moment in another: loop closures; motion too when there is no odometry source."""
 
     kind: Literal["relative"] = "relative"
-    sigma_translation: float = Field(0.1, gt=0, description="m, where the message's covariance is zero")
-    sigma_rotation: float = Field(0.05, gt=0, description="rad, where the message's covariance is zero")
+    sigma_translation: float = Field(
+        0.1, gt=0, le=1e6, description="m, where the message's covariance is zero"
+    )
+    sigma_rotation: float = Field(
+        0.05, gt=0, le=1e6, description="rad, where the message's covariance is zero"
+    )
 
 
 class LandmarkSource(Observing):
     """Observations of landmarks with known ids."""
 
     kind: Literal["landmark"] = "landmark"
-    sigma_position: float = Field(0.1, gt=0, description="m, for positions without noise of their own")
-    sigma_range: float = Field(0.1, gt=0, description="m, for ranges without noise of their own")
-    sigma_bearing: float = Field(0.02, gt=0, description="rad, for bearings without noise of their own")
+    sigma_position: float = Field(
+        0.1, gt=0, le=1e6, description="m, for positions without noise of their own"
+    )
+    sigma_range: float = Field(0.1, gt=0, le=1e6, description="m, for ranges without noise of their own")
+    sigma_bearing: float = Field(
+        0.02, gt=0, le=1e6, description="rad, for bearings without noise of their own"
+    )
 
 
 class PoseSource(Observing):
     """Absolute pose of the base in the map frame (a localizer, /initialpose)."""
 
     kind: Literal["pose"] = "pose"
-    sigma_translation: float = Field(0.5, gt=0, description="m, where the message's covariance is zero")
-    sigma_rotation: float = Field(0.25, gt=0, description="rad, where the message's covariance is zero")
+    sigma_translation: float = Field(
+        0.5, gt=0, le=1e6, description="m, where the message's covariance is zero"
+    )
+    sigma_rotation: float = Field(
+        0.25, gt=0, le=1e6, description="rad, where the message's covariance is zero"
+    )
 
 
 AnySource = Annotated[
@@ -215,16 +231,20 @@ def config_from(data: Mapping[str, Any], origin: str = "config") -> Config:
         data = inner["ros__parameters"]
     flat = dict(data)
     listed = flat.get("sources", [])
+    if isinstance(listed, str):
+        raise BadConfig(f"{origin}: 'sources' is a list of names: write sources: [{listed}]")
     if isinstance(listed, (list, tuple)):
         if wrong := [name for name in listed if not isinstance(name, str)]:
             raise BadConfig(
                 f"{origin}: 'sources' is a list of names, each described below it; it holds {wrong[0]!r}"
             )
+        if len(set(listed)) < len(listed):
+            raise BadConfig(f"{origin}: 'sources' names {max(listed, key=listed.count)!r} twice")
         if missing := [name for name in listed if name not in flat]:
             raise BadConfig(
                 f"{origin}: source '{missing[0]}' is listed in 'sources' but not described: add '{missing[0]}: {{kind: ...}}'"
             )
-        flat["sources"] = {name: flat.pop(name) for name in dict.fromkeys(listed)}
+        flat["sources"] = {name: flat.pop(name) for name in listed}
     try:
         return Config.model_validate(flat)
     except ValidationError as error:
@@ -255,6 +275,10 @@ def _first_line(error: ValidationError) -> str:
         parts = [*parts[1:2], *parts[3:]]  # as in the file: without 'sources' and the kind
     where = ".".join(parts) or "the file"
     what = first["msg"].removeprefix("Value error, ")
+    if first["type"] == "union_tag_invalid":
+        what = f"there is no kind of source {first['ctx']['tag']!r}; known: {first['ctx']['expected_tags']}"
+    if first["type"] == "union_tag_not_found":
+        what = "is a source, and does not say its kind: add kind: odometry, relative, landmark or pose"
     if first["type"] == "extra_forbidden":
         what = f"there is no such setting{_suggest(first['loc'])}"
     more = error.error_count() - 1

@@ -50,6 +50,8 @@ def replay(
     try:
         if config is None or not config.sources:
             found, notes = discover(opened)
+            opened.close()
+            opened = open_inputs(paths)  # what the first look found damaged is not to be said twice
             given = {} if config is None else config.model_dump(exclude_unset=True, exclude={"sources"})
             config = config_from({**config_to(found), **given}, "configuration")
         config = configured(config, settings)

@@ -2,6 +2,7 @@
 
 import csv
 import json
+import os
 from collections import Counter
 from collections.abc import Iterable, Mapping
 from functools import cached_property
@@ -30,10 +31,16 @@ FILES = ("summary.json", "config.yaml", "trajectory.tum", "odometry.tum", "onlin
          "decisions.jsonl", "graph.g2o", "linearized.npz")  # fmt: skip
 
 
+PICTURE = "trajectory.png"  # drawn by the command line
+
+
 def write_run(result: Result, out: Path | str) -> None:
     """Write the files of one run. An earlier run in the same directory is replaced; BadFile for anything else there."""
     out = Path(out)
     prepare(out)
+    out.mkdir(parents=True, exist_ok=True)
+    for stale in ("summary.json", PICTURE):  # the summary comes last, and says that the run is whole
+        (out / stale).unlink(missing_ok=True)
     snapshot = result.snapshot
     for name, trajectory in (
         ("trajectory", snapshot.trajectory),
@@ -51,12 +58,28 @@ def write_run(result: Result, out: Path | str) -> None:
 
 
 def prepare(out: Path) -> None:
-    """Make the directory, or see that it holds nothing but an earlier run."""
+    """See that a run can be written here, before the work is done; makes nothing. BadFile says why not."""
     if out.exists() and not out.is_dir():
         raise BadFile(f"{out}: is a file; name a directory for the run")
-    if out.is_dir() and any(out.iterdir()) and not (out / "summary.json").exists():
+    there = next((folder for folder in (out, *out.parents) if folder.exists()), out)
+    if not there.is_dir():
+        raise BadFile(f"{out}: cannot be made: {there} is a file")
+    if not os.access(there, os.W_OK | os.X_OK):
+        raise BadFile(f"{out}: cannot be written: no permission in {there}")
+    if out.is_dir() and not _is_run(out):
         raise BadFile(f"{out}: holds other files and no earlier run; name a new or empty directory")
-    out.mkdir(parents=True, exist_ok=True)
+
+
+def _is_run(out: Path) -> bool:
+    """Whether a directory holds nothing but a run, whole or broken off."""
+    if any(path.name not in (*FILES, PICTURE) for path in out.iterdir()):
+        return False
+    try:
+        return "run_hash" in json.loads((out / "summary.json").read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        return True  # broken off before its summary was written
+    except (OSError, ValueError):
+        return False
 
 
 def _write_decisions(path: Path, result: Result) -> None:

@@ -155,7 +155,7 @@ def test_an_unknown_kind_lists_the_known_ones():
         ({"sources": ["a"]}, "'a' is listed in 'sources' but not described"),
         ({"sources": [{"a": {"kind": "odometry"}}]}, "a list of names"),
         ({"sources": [3]}, "a list of names"),
-        ({"sources": "wheels"}, "valid dictionary"),
+        ({"sources": "wheels"}, "write sources: [wheels]"),
         ({"sources": ["a"], "a": 3}, "a: "),
         ({"sources": ["a"], "a": None}, "a: "),
         ({"sources": ["a/b"], "a/b": {"kind": "odometry"}}, "'/' or '@'"),
@@ -170,8 +170,9 @@ def test_sources_that_cannot_be_are_one_clear_line(data, said):
     assert said in complaint(data)
 
 
-def test_a_source_that_is_listed_twice_is_one_source():
-    assert list(config_from({**wheels(), "sources": ["wheels", "wheels"]}).sources) == ["wheels"]
+def test_a_source_that_is_listed_twice_is_refused():
+    with pytest.raises(BadConfig, match="names 'wheels' twice"):
+        config_from({**wheels(), "sources": ["wheels", "wheels"]})
 
 
 def test_sources_may_be_given_as_a_mapping_too():
