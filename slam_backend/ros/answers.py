@@ -199,8 +199,8 @@ def serve(pipe: Connection, service: str, namespace: str, frame: str) -> None:
         server.listen()
         context.try_shutdown()
 
-    threading.Thread(target=listen, name="listen", daemon=True).start()
     executor = SingleThreadedExecutor(context=context)
     executor.add_node(node)
+    threading.Thread(target=listen, name="listen", daemon=True).start()  # it may be told at once to end
     with suppress(ExternalShutdownException):
         executor.spin()

@@ -6,10 +6,10 @@ from typing import Any
 
 from ..core.config import Config, config_from, config_to
 from ..core.errors import BadConfig
+from ..core.sensors.odometry import TRANSFORMS
 from ..io.discover import is_truth, kind_of, name_of
 from ..io.records import Record
 
-TRANSFORMS = "tf2_msgs/msg/TFMessage"
 PATIENCE: Mapping[
     tuple[str, str], float
 ] = {  # s that a topic waits for a better one before it drives the keyframes
@@ -29,9 +29,10 @@ class Finder:
         self._since: dict[str, float] = {}
         self.unused: dict[str, str] = {}  # topic -> why
 
-    def wants(self, topic: str) -> bool:
-        """Whether its messages are to be kept: it is a source, or may become one."""
-        return topic in self._kinds and topic not in self.unused
+    def wants(self, record: Record) -> bool:
+        """Whether the message is to be kept: its topic is a source, or may become one; of transforms, the odometry only."""
+        known = record.topic in self._kinds and record.topic not in self.unused
+        return known and (record.type != TRANSFORMS or kind_of(record, self._typestore) is not None)
 
     def look(self, record: Record, config: Config) -> Config:
         """The configuration; with this topic as a source, and those that waited for it, once it can be one."""
@@ -47,7 +48,7 @@ class Finder:
             return config
         config = self._with(topic, config)
         for other in self._kinds:
-            if self.wants(other) and self._kinds[other] in ("landmark", "pose"):
+            if other not in self.unused and self._kinds[other] in ("landmark", "pose"):
                 config = self._with(other, config)
         return config
 

@@ -195,6 +195,7 @@ class BackendNode(LifecycleNode):
         self._refresh.set()
         self._silence()
         with self._changing:
+            self._drain()
             session, self._session = self._session, None
             if session is not None:
                 self._end(session)
@@ -206,18 +207,34 @@ class BackendNode(LifecycleNode):
     def reset(self) -> None:
         """A new session: the run so far is saved, its journal set aside, the map starts empty. Takes a while; any thread.
 
-        What is heard meanwhile waits for the new session.
+        What is heard meanwhile waits for the new session. SlamError if there can be none.
         """
         with self._changing:
             if self._closed.is_set():
                 raise SlamError("there is no session: the node is not configured")
             session, self._session = self._session, None
-            if session is not None:
-                self._end(session)
-            self.state.clear()
-            self._odometer = Odometer(self.config)
-            self._session = self._opened()
+            self._renew(session)
+
+    def _renew(self, ended: Session | None) -> None:
+        if ended is not None:
+            self._end(ended)
+        self.state.clear()
+        self._odometer = Odometer(self.config)
+        self._session = self._opened()
         self.get_logger().info("a new session has begun")
+
+    def _renew_in_background(self, ended: Session | None) -> None:
+        """A thread, which has been given the lock."""
+        try:
+            while not self._closed.is_set() or ended is not None:
+                try:
+                    return self._renew(ended)
+                except SlamError as error:
+                    self.incident(str(error))
+                    ended = None
+                    self._closed.wait(AGAIN)
+        finally:
+            self._changing.release()
 
     def _silence(self) -> None:
         """Neither listen nor publish."""
@@ -283,14 +300,18 @@ class BackendNode(LifecycleNode):
 
     @_survived
     def _look(self) -> None:
+        self._drain()  # what came while a new session began, and nothing has come since
         if self._inputs is not None:
             self._inputs.look(self.config)
 
     @_survived
     def _received(self, topic: str, type_: str, data: bytes) -> None:
         self._early.append((topic, type_, data))
-        while self._early and self._session is not None:
-            self._take(self._session, *self._early.popleft())
+        self._drain()
+
+    def _drain(self) -> None:
+        while self._early and (session := self._session) is not None:
+            self._take(session, *self._early.popleft())
 
     def _take(self, session: Session, topic: str, type_: str, data: bytes) -> None:
         record = Record(topic, type_, 0, data)
@@ -334,7 +355,7 @@ class BackendNode(LifecycleNode):
         if record.topic in finder.unused and self._inputs is not None and record.topic in self._inputs.flows:
             self.get_logger().info(f"{record.topic} is left aside: {finder.unused[record.topic]}")
             self._inputs.ignore(record.topic)
-        return finder.wants(record.topic)
+        return finder.wants(record)
 
     def _odometry_in(self, record: Record) -> list[OdometryPose]:
         """What the driving source says in it, unless it cannot be right."""
@@ -342,11 +363,14 @@ class BackendNode(LifecycleNode):
         return [item for item in checked(told, self.config) if isinstance(item, OdometryPose)] if told else []
 
     def _begins_anew(self, source: str) -> bool:
+        """Whether a new session is on its way, since the clock has jumped; from here on messages wait for it."""
         choice = self.config.on_clock_jump
         self.incident(f"the clock of '{source}' jumped back; on_clock_jump: {choice}")
-        if choice == "reset":
-            threading.Thread(target=self._reset_in_background, name="reset", daemon=True).start()
-        return choice == "reset"
+        if choice != "reset" or not self._changing.acquire(blocking=False):
+            return False
+        session, self._session = self._session, None
+        threading.Thread(target=self._renew_in_background, args=(session,), name="reset", daemon=True).start()
+        return True
 
     def _moved(self, odometry: OdometryPose) -> None:
         outputs = self._outputs
@@ -430,15 +454,6 @@ class BackendNode(LifecycleNode):
             self._outputs.config = self.config
         if "refresh" in self._beats:
             self._beats["refresh"].timer_period_ns = round(SECOND / self.config.path.rate)
-
-    def _reset_in_background(self) -> None:
-        while not self._closed.is_set():
-            try:
-                return self.reset()
-            except SlamError as error:
-                self.incident(str(error))
-                self._closed.wait(AGAIN)
-        return None
 
 
 def _resolved(config: Config, resolve: Callable[[str], str]) -> Config:

@@ -29,7 +29,9 @@ def config_of(node: Node, start: Config) -> Config:
         for part in path:
             section = section.setdefault(part, {})
             if not isinstance(section, dict):
-                raise BadConfig(f"parameters: {name}: '{part}' is a setting, and has none below it")
+                break
+        if not isinstance(section, dict) or isinstance(section.get(leaf), dict):
+            raise BadConfig(f"parameters: {name}: a setting cannot have a value and settings below it")
         value = parameter.value
         section[leaf] = (
             list(value) if isinstance(value, Sequence | array) and not isinstance(value, str) else value

@@ -36,7 +36,7 @@ def test_what_runs_live_is_what_replay_computes(backend, peer, drive) -> None:
     begin = time.monotonic()
     pose = peer.hear("/slam_backend/pose", "geometry_msgs/msg/PoseWithCovarianceStamped")
     peer.play(drive.records, rate=10)
-    assert pose
+    peer.until(lambda: pose)
     summary = node.end()
     assert time.monotonic() - begin < 30
     assert summary["counts"]["records"] == len(drive.records)
@@ -62,7 +62,12 @@ def test_stops_and_deaths_lose_nothing(backend, peer, drive) -> None:
 
 @pytest.mark.parametrize(
     "numbers",
-    [[signal.SIGINT], [signal.SIGTERM], [signal.SIGINT, signal.SIGINT], [signal.SIGTERM, signal.SIGINT]],
+    [
+        [signal.SIGINT, signal.SIGINT],
+        pytest.param([signal.SIGINT], marks=pytest.mark.slow),
+        pytest.param([signal.SIGTERM], marks=pytest.mark.slow),
+        pytest.param([signal.SIGTERM, signal.SIGINT], marks=pytest.mark.slow),
+    ],
 )
 def test_a_signal_ends_it_with_the_run_saved(backend, peer, drive, numbers) -> None:
     """Within two seconds for a small graph; a second signal does not tear the saving."""
@@ -78,7 +83,9 @@ def test_a_signal_ends_it_with_the_run_saved(backend, peer, drive, numbers) -> N
     assert "run hash" in node.process.output
 
 
-@pytest.mark.parametrize("moment", [0.0, 0.3, 0.6, 1.0])
+@pytest.mark.parametrize(
+    "moment", [1.0, *(pytest.param(t, marks=pytest.mark.slow) for t in (0.0, 0.3, 0.6, 1.4))]
+)
 def test_a_signal_while_it_starts_ends_it_too(backend, drive, moment) -> None:
     """Wherever it is then: no traceback of its own or of its processes, nobody left behind."""
     node = backend(drive.config)
