@@ -73,6 +73,12 @@ class Process:
         return self._timeout.poll() is None
 
     @property
+    def cpu_seconds(self) -> float:
+        """That python has used, in user and system."""
+        ticks = Path(f"/proc/{self.pid}/stat").read_text().rpartition(")")[2].split()[11:13]
+        return sum(map(int, ticks)) / os.sysconf("SC_CLK_TCK")
+
+    @property
     def output(self) -> str:
         """Standard output and errors so far."""
         return self._log.read_text(errors="replace")

@@ -204,6 +204,7 @@ class Told:
         return -1, "", {}
 
 
+@pytest.mark.slow
 def test_diagnostics_say_how_everything_is(backend, peer, drive) -> None:
     """A source without publisher, a silent one, one that sends rubbish; what the solver does, with numbers."""
     node = backend(drive.config)
@@ -235,6 +236,7 @@ def test_diagnostics_say_how_everything_is(backend, peer, drive) -> None:
     node.end()
 
 
+@pytest.mark.slow
 def test_poses_on_a_topic_of_their_own_wait_for_odometry(backend, peer) -> None:
     """A pose in the map, heard before any odometry, is a source once there is one; nothing of it is lost."""
     node = backend()

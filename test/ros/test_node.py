@@ -1,16 +1,20 @@
 """The node over DDS, between processes: what runs live is what replay computes, whoever stops or dies meanwhile."""
 
+import json
 import os
 import signal
+import sqlite3
 import time
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 pytest.importorskip("rclpy")
 
 import slam_backend as sb
 
+LOAD = Path(__file__).parent / "load.py"
 WAREHOUSE = Path(__file__).parents[2] / "bags" / "warehouse.mcap"
 ODOMETRY = "nav_msgs/msg/Odometry"
 
@@ -31,11 +35,11 @@ def stopped(pid, seconds):
 
 
 def test_what_runs_live_is_what_replay_computes(backend, peer, drive) -> None:
-    """At ten times its speed, undisturbed: the hash is that of the journal's replay, and of the bag's."""
+    """At twenty times its speed, undisturbed: the hash is that of the journal's replay, and of the bag's."""
     node = backend(drive.config)
     begin = time.monotonic()
     pose = peer.hear("/slam_backend/pose", "geometry_msgs/msg/PoseWithCovarianceStamped")
-    peer.play(drive.records, rate=10)
+    peer.play(drive.records, rate=20)
     peer.until(lambda: pose)
     summary = node.end()
     assert time.monotonic() - begin < 30
@@ -53,7 +57,7 @@ def test_stops_and_deaths_lose_nothing(backend, peer, drive) -> None:
         2 * third: stopped(node.worker, 1),
         3 * third: lambda: os.kill(node.worker(), signal.SIGKILL),
     }
-    peer.play(drive.records, rate=10, extra=acts.items())
+    peer.play(drive.records, rate=20, extra=acts.items())
     node.process.wait_for("the worker was lost (it ended with code -9)")
     summary = node.end()
     assert summary["counts"]["records"] == len(drive.records)
@@ -122,3 +126,39 @@ def test_the_warehouse_at_five_times_its_speed(backend, start, trouble) -> None:
     live, offline = summary, sb.replay(WAREHOUSE, sb.load_config(config)).result.summary
     assert live["counts"]["records"] == offline["counts"]["records"]
     assert live["run_hash"] == node.replayed()["run_hash"] == offline["run_hash"]
+
+
+def latencies(process):
+    """Per second of the run: median, 99th percentile, maximum, in ms."""
+    process.end()
+    heard = np.array(json.loads(process.output.splitlines()[-1]))
+    seconds = (heard[:, 0] - heard[0, 0]) // 1e9
+    return [tuple(np.percentile(heard[seconds == s, 1], [50, 99, 100])) for s in np.unique(seconds)]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("hz", "loops", "stall"), [(1000, 20, 0), (200, 10, 5), (200, 20, 0)])
+def test_at_the_rates_of_a_robot_nothing_is_lost(backend, start, hz, loops, stall) -> None:
+    """The journal has every message, though the worker stands still for a while; ~/odometry does not wait for the solver."""
+    sources = ["wheels={kind: odometry, topic: /odom}", "loops={kind: relative, topic: /loops}"]
+    node = backend(None, settings=["space=2d", "sources=[wheels,loops]", *sources])
+    hearing = start(LOAD, "hear", "/slam_backend/odometry")
+    hearing.wait_for("ready")
+    sending = start(LOAD, "send", hz, 12, loops)
+    sending.wait_for("matched")
+    if stall:
+        time.sleep(2)
+        stopped(node.worker, stall)()
+    _, odometry, _, told, *_ = sending.wait_for("sent ", 40).split()
+    assert node.process.cpu_seconds < 12  # a core, its start included
+    medians, tails, _ = zip(*latencies(hearing), strict=True)
+    assert np.median(medians) < 10  # ms
+    assert hz > 200 or np.median(tails) < 20
+    summary = node.end()
+    journal = sqlite3.connect(node.folder / "journal.db3")
+    rows = dict(
+        journal.execute("SELECT t.name, count(*) FROM messages m JOIN topics t ON t.id = topic_id GROUP BY 1")
+    )
+    assert rows == {"/odom": int(odometry), "/loops": int(told)} == {"/odom": hz * 12, "/loops": int(told)}
+    assert summary["counts"]["records"] == hz * 12 + int(told)
+    assert summary["run_hash"] == node.replayed()["run_hash"]
