@@ -1,5 +1,6 @@
 """`slam-backend run`: the ROS 2 node, on a ROS install or with the wheels of the extra `ros`."""
 
+import signal
 import sys
 from pathlib import Path
 from typing import Annotated
@@ -32,6 +33,9 @@ def command(
     chosen = configured(load_config(config) if config else Config(), settings or ())
     if data_dir:
         chosen = chosen.model_copy(update={"data_dir": data_dir})
+    signal.pthread_sigmask(
+        signal.SIG_BLOCK, {signal.SIGINT, signal.SIGTERM}
+    )  # until the node is there to hear them
     try:
         from ..ros.node import main
     except ImportError as error:

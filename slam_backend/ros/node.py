@@ -8,9 +8,7 @@ so that it never waits for the solver. No callback blocks, and none ends the nod
 import signal
 import sys
 import threading
-from collections import deque
 from collections.abc import Callable, Sequence
-from functools import wraps
 from itertools import count
 from pathlib import Path
 from time import monotonic
@@ -19,77 +17,38 @@ from typing import Any
 import rclpy
 from rclpy.clock import Clock, ClockType
 from rclpy.executors import SingleThreadedExecutor
-from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
+from rclpy.lifecycle import LifecycleState, TransitionCallbackReturn
 from rclpy.parameter import Parameter
 from rclpy.signals import SignalHandlerOptions
 
-from ..core.check import checked
 from ..core.config import Config, config_from, config_to
 from ..core.errors import SlamError
 from ..core.graph import Decision
 from ..core.measurement import SECOND
-from ..core.sensors.odometry import TRANSFORMS, OdometryPose
-from ..io.cdr import Decoder
+from ..core.sensors.odometry import OdometryPose
 from ..io.feeder import Feeder, undisturbed
-from ..io.inputs import TF_STATIC
-from ..io.journal import LIMIT
-from ..io.records import Record
 from ..io.typestore import typestore_of
 from .diagnostics import Diagnostics
-from .finder import Finder
 from .inputs import Inputs
+from .intake import Intake
 from .outputs import Outputs
 from .parameters import changed, config_of, declare
 from .pose import Odometer
 from .services import Services
 from .session import RUN, Session
 from .state import State
+from .steadfast import SteadfastNode, explained, survived
 
 LOOK = 0.3  # s between two looks at the graph
 BEAT = 0.1  # s within which a signal is heard
-JUMP = SECOND  # ns that the driving source must go back for its clock to have jumped
-DOUBTFUL = 10_000  # messages at most that are kept in case its clock has jumped
 WATCHED = ("path", "trajectory", "landmarks", "graph")  # outputs that are made from a snapshot
 FAREWELL = 30.0  # s that the worker may take to flush and save at the end
 DEFAULT_ODOM = Config().odom_frame
 AGAIN = 5.0  # s after which the same incident is worth another line
 STEADY = Clock(clock_type=ClockType.STEADY_TIME)  # timers run whether or not /clock does
-Transition = Callable[["BackendNode", LifecycleState], TransitionCallbackReturn]
 
 
-def _explained(transition: Transition) -> Transition:
-    """Rclpy swallows what a transition raises; say it, let go of everything, and fail."""
-
-    @wraps(transition)
-    def wrapped(node: "BackendNode", state: LifecycleState) -> TransitionCallbackReturn:
-        try:
-            return transition(node, state)
-        except SlamError as error:
-            node.get_logger().error(str(error))
-        except Exception as error:  # noqa: BLE001  # whatever it is, it must be said
-            node.get_logger().error(f"{transition.__name__}: {type(error).__name__}: {error}")
-        if transition.__name__ == "on_configure":
-            node.close()
-        return TransitionCallbackReturn.FAILURE
-
-    return wrapped
-
-
-def _survived(callback: Callable[..., None]) -> Callable[..., None]:
-    """What leaves a callback would end the node: it becomes an incident."""
-
-    @wraps(callback)
-    def wrapped(node: "BackendNode", *arguments: Any) -> None:
-        try:
-            callback(node, *arguments)
-        except Exception as error:  # noqa: BLE001  # whatever it is
-            what = " ".join(str(error).split())
-            node.incident(f"{callback.__name__.strip('_')} failed: {type(error).__name__}: {what}")
-
-    return wrapped
-
-
-class BackendNode(LifecycleNode):
+class BackendNode(SteadfastNode):
     def __init__(self, name: str = "slam_backend", start: Config | None = None, **options: Any) -> None:
         """start: what the parameters override. BadConfig when they make no configuration."""
         super().__init__(name, automatically_declare_parameters_from_overrides=True, **options)
@@ -102,20 +61,12 @@ class BackendNode(LifecycleNode):
         self._typestore = typestore_of(())
         self._changed = self.create_guard_condition(self._publish)
         self._refresh = threading.Event()
-        self._session: Session | None = None
-        self._early: deque[tuple[str, str, bytes]] = deque(maxlen=LIMIT)  # heard between two sessions
-        self._doubtful: list[
-            tuple[str, str, bytes]
-        ] = []  # since the odometry went back in time; its next one tells
-        self._static: dict[
-            bytes, str
-        ] = {}  # what came on /tf_static, and its type: it comes once, and is for every session
-        self._finder: Finder | None = None  # where no sources are configured
+        self.session: Session | None = None
+        self._intake: Intake | None = None
         self._inputs: Inputs | None = None
         self._outputs: Outputs | None = None
         self._answering: Services | None = None
         self._diagnostics: Diagnostics | None = None
-        self._decoder = Decoder(self._typestore, {})  # of the driving source
         self._odometer = Odometer(self.config)
         self._beats: dict[str, Any] = {}
         self._count = count(1)
@@ -131,19 +82,17 @@ class BackendNode(LifecycleNode):
 
     # -- lifecycle -------------------------------------------------------------------------------
 
-    @_explained
+    @explained
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:  # noqa: ARG002
         self._closed = threading.Event()
         self.state.clear()
-        self._early.clear()
-        self._static.clear()
         self.config = self._given
-        self._finder = None if self._given.sources else Finder(self._typestore)
+        self._intake = Intake(self, self._typestore, finding=not self._given.sources)
         frames = self.config.map_frame, self.config.odom_frame, self.config.base_frame or "base_link"
         self._outputs = Outputs(self, self.config, *frames)
         self._outputs.set_active(False)
         self._diagnostics = Diagnostics(self, self.state)
-        self._session = self._opened()
+        self.session = self._opened()
         with undisturbed():  # the services start a process
             self._answering = Services(
                 self, self.state, self._feeder, self._refresh.set, self.data_dir, self.config, self.reset
@@ -151,9 +100,9 @@ class BackendNode(LifecycleNode):
         threading.Thread(target=self._snapshots, args=(self._closed,), name="snapshots", daemon=True).start()
         return TransitionCallbackReturn.SUCCESS
 
-    @_explained
+    @explained
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:  # noqa: ARG002
-        self._inputs = Inputs(self, self._received, finding=self._finder is not None)
+        self._inputs = Inputs(self, self._received, finding=not self._given.sources)
         table: dict[str, tuple[float, Callable[[], None]]] = {
             "look": (LOOK, self._look),
             "refresh": (1.0 / self.config.path.rate, self._refresh_if_watched),
@@ -165,29 +114,20 @@ class BackendNode(LifecycleNode):
         self._look()
         return TransitionCallbackReturn.SUCCESS
 
-    @_explained
+    @explained
     def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:  # noqa: ARG002
         self._silence()
         return TransitionCallbackReturn.SUCCESS
 
-    @_explained
+    @explained
     def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:  # noqa: ARG002
         self.close()
         return TransitionCallbackReturn.SUCCESS
 
-    @_explained
+    @explained
     def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:  # noqa: ARG002
         self.close()
         return TransitionCallbackReturn.SUCCESS
-
-    def _LifecycleNodeMixin__on_change_state(self, request: Any, response: Any) -> Any:  # noqa: N802
-        """A transition that is not legal here is answered, not died of: rclpy raises it out of spin."""
-        try:
-            return super()._LifecycleNodeMixin__on_change_state(request, response)
-        except Exception as error:  # noqa: BLE001  # RCLError is no public class
-            self.get_logger().warning(f"transition refused: {str(error).splitlines()[0]}")
-            response.success = False
-            return response
 
     def close(self) -> None:
         """Save the run, let go of everything. Safe to call twice."""
@@ -195,14 +135,15 @@ class BackendNode(LifecycleNode):
         self._refresh.set()
         self._silence()
         with self._changing:
-            self._drain()
-            session, self._session = self._session, None
+            if self._intake is not None:
+                self._intake.drain()
+            session, self.session = self.session, None
             if session is not None:
                 self._end(session)
         for part in (self._answering, self._outputs, self._diagnostics):
             if part is not None:
                 part.close()
-        self._answering = self._outputs = self._diagnostics = None
+        self._answering = self._outputs = self._diagnostics = self._intake = None
 
     def reset(self) -> None:
         """A new session: the run so far is saved, its journal set aside, the map starts empty. Takes a while; any thread.
@@ -212,7 +153,7 @@ class BackendNode(LifecycleNode):
         with self._changing:
             if self._closed.is_set():
                 raise SlamError("there is no session: the node is not configured")
-            session, self._session = self._session, None
+            session, self.session = self.session, None
             self._renew(session)
 
     def _renew(self, ended: Session | None) -> None:
@@ -220,7 +161,7 @@ class BackendNode(LifecycleNode):
             self._end(ended)
         self.state.clear()
         self._odometer = Odometer(self.config)
-        self._session = self._opened()
+        self.session = self._opened()
         self.get_logger().info("a new session has begun")
 
     def _renew_in_background(self, ended: Session | None) -> None:
@@ -252,20 +193,20 @@ class BackendNode(LifecycleNode):
     def _opened(self) -> Session:
         """Journal and worker. BadFile where the data directory cannot be used."""
         session = Session(self.data_dir, self.state, self.incident)
-        for data, type_ in self._static.items():
-            session.journal.append(TF_STATIC, type_, data)
+        if self._intake is not None:
+            self._intake.begin(session)
         if self.config.sources:
-            self._work(session, self.config)
+            self.work(session, self.config)
         return session
 
-    def _work(self, session: Session, config: Config) -> None:
+    def work(self, session: Session, config: Config) -> None:
         """Solve with these sources from the start of the session on."""
+        for name in set(config.sources) - set(self.config.sources):
+            self.get_logger().info(f"{config.sources[name].topic} is used as {config.sources[name].kind}")
         self.config = config
-        assert config.driver is not None
-        source = config.sources[config.driver]
-        drives = {source.topic: (config.driver, source.kind)} if source.kind == "odometry" else {}
-        self._decoder = Decoder(self._typestore, drives)
         self._odometer = Odometer(config)
+        if self._intake is not None:
+            self._intake.use(config)
         session.work(config)
 
     def _end(self, session: Session) -> None:
@@ -282,7 +223,7 @@ class BackendNode(LifecycleNode):
         )
 
     def _feeder(self) -> Feeder | None:
-        session = self._session
+        session = self.session
         return session.feeder if session is not None else None
 
     def incident(self, what: str) -> None:
@@ -298,81 +239,35 @@ class BackendNode(LifecycleNode):
 
     # -- the way in ------------------------------------------------------------------------------
 
-    @_survived
+    @survived
     def _look(self) -> None:
-        self._drain()  # what came while a new session began, and nothing has come since
-        if self._inputs is not None:
+        if self._intake is not None and self._inputs is not None:
+            self._intake.drain()  # what came while a new session began, and nothing has come since
             self._inputs.look(self.config)
 
-    @_survived
+    @survived
     def _received(self, topic: str, type_: str, data: bytes) -> None:
-        self._early.append((topic, type_, data))
-        self._drain()
+        if self._intake is not None:
+            self._intake.receive(topic, type_, data)
 
-    def _drain(self) -> None:
-        while self._early and (session := self._session) is not None:
-            self._take(session, *self._early.popleft())
+    def ignore(self, topic: str, why: str) -> None:
+        """What comes on this topic is of no use."""
+        if self._inputs is not None and topic in self._inputs.flows:
+            self.get_logger().info(f"{topic} is left aside: {why}")
+            self._inputs.ignore(topic)
 
-    def _take(self, session: Session, topic: str, type_: str, data: bytes) -> None:
-        record = Record(topic, type_, 0, data)
-        if self._finder is not None and not self._is_wanted(session, record, self._finder):
-            return
-        odometry = self._odometry_in(record)
-        for item in odometry:
-            if self._odometer.jumped_back(item.stamp, JUMP) and self._begins_anew(item.source):
-                self._early.extendleft(reversed([*self._doubtful, (topic, type_, data)]))
-                self._doubtful = []
-                return
-        if self._odometer.doubts and len(self._doubtful) < DOUBTFUL:
-            self._doubtful.append((topic, type_, data))
-        elif odometry:
-            self._doubtful = []
-        if topic == TF_STATIC:
-            self._static[data] = type_
-        of_other_frames = type_ == TRANSFORMS and topic in self._driving and not odometry
-        if not of_other_frames and not session.journal.append(topic, type_, data):
-            self._early.appendleft((topic, type_, data))  # the session has just ended
-            return
-        for item in odometry:
-            self._moved(item)
-
-    @property
-    def _driving(self) -> Sequence[str]:
-        """The topic of the odometry, if one drives."""
-        driver = self.config.driver
-        return () if driver is None else (self.config.sources[driver].topic,)
-
-    def _is_wanted(self, session: Session, record: Record, finder: Finder) -> bool:
-        """Without configured sources: whether the message is worth keeping; a new source gets a worker that knows it."""
-        if record.topic == TF_STATIC:
-            return True
-        config = finder.look(record, self.config)
-        if config is not self.config:
-            for name in set(config.sources) - set(self.config.sources):
-                source = config.sources[name]
-                self.get_logger().info(f"{source.topic} is used as {source.kind}")
-            self._work(session, config)
-        if record.topic in finder.unused and self._inputs is not None and record.topic in self._inputs.flows:
-            self.get_logger().info(f"{record.topic} is left aside: {finder.unused[record.topic]}")
-            self._inputs.ignore(record.topic)
-        return finder.wants(record)
-
-    def _odometry_in(self, record: Record) -> list[OdometryPose]:
-        """What the driving source says in it, unless it cannot be right."""
-        told = self._decoder.decode(record)
-        return [item for item in checked(told, self.config) if isinstance(item, OdometryPose)] if told else []
-
-    def _begins_anew(self, source: str) -> bool:
-        """Whether a new session is on its way, since the clock has jumped; from here on messages wait for it."""
+    def begins_anew(self, source: str) -> bool:
+        """The clock of a source has jumped: whether a new session is on its way. Then messages wait for it."""
         choice = self.config.on_clock_jump
         self.incident(f"the clock of '{source}' jumped back; on_clock_jump: {choice}")
         if choice != "reset" or not self._changing.acquire(blocking=False):
             return False
-        session, self._session = self._session, None
+        session, self.session = self.session, None
         threading.Thread(target=self._renew_in_background, args=(session,), name="reset", daemon=True).start()
         return True
 
-    def _moved(self, odometry: OdometryPose) -> None:
+    def moved(self, odometry: OdometryPose) -> None:
+        """The driving odometry said something sound: where the robot is in the map, at once."""
         outputs = self._outputs
         if outputs is None or not self._odometer.goes_on(odometry.stamp):
             return
@@ -398,7 +293,7 @@ class BackendNode(LifecycleNode):
         if not self._closed.is_set():
             self._changed.trigger()
 
-    @_survived
+    @survived
     def _publish(self) -> None:
         outputs, update = self._outputs, self.state.update
         if outputs is None or not self._beats:
@@ -433,20 +328,20 @@ class BackendNode(LifecycleNode):
                 shown = update
             closed.wait(4 * (monotonic() - begin))  # at most a fifth of the worker's time
 
-    @_survived
+    @survived
     def _refresh_if_watched(self) -> None:
         if self._outputs is not None and any(map(self._outputs.has_listeners, WATCHED)):
             self._refresh.set()
 
-    @_survived
+    @survived
     def _diagnose(self) -> None:
-        session = self._session
+        session = self.session
         if self._inputs is not None and self._diagnostics is not None:
             self._diagnostics.publish(
                 self._inputs, self._feeder(), session.journal if session else None, self.config
             )
 
-    @_survived
+    @survived
     def _parameters_were_set(self, parameters: list[Parameter]) -> None:
         self._given, _ = changed(self._given, parameters)
         self.config, _ = changed(self.config, parameters)
@@ -472,6 +367,7 @@ def main(arguments: list[str] | None = None, config: Config | None = None) -> in
     wishes: list[int] = []
     for wish in (signal.SIGINT, signal.SIGTERM):
         signal.signal(wish, lambda number, _: wishes.append(number))  # more than one changes nothing
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT, signal.SIGTERM})
     try:
         rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
         node = BackendNode(start=config)

@@ -32,25 +32,11 @@ class Odometer:
 
     def __init__(self, config: Config) -> None:
         self._space = SPACES[config.space]
-        self._newest = self._last = 0
-        self._behind: int | None = None  # a stamp that went back, and waits for a second
+        self._last = 0
         self._told: Update | None = None
         self._covariance: tuple[Update, int, Array] | None = None
         driving = config.sources.get(config.driver) if config.driver else None
         self._noise = driving if isinstance(driving, OdometrySource) else OdometrySource()
-
-    def jumped_back(self, stamp: int, by: int) -> bool:
-        """Whether this stamp (ns) confirms a jump: the second in a row that lies further back than `by`; told once for each."""
-        behind = stamp < self._newest - by
-        jumped = behind and self._behind is not None and self._behind < stamp < self._behind + by
-        self._behind = stamp if behind and not jumped else None
-        self._newest = stamp if jumped else max(self._newest, stamp)
-        return jumped
-
-    @property
-    def doubts(self) -> bool:
-        """Whether the newest stamp went back, and the next one tells whether it was a jump."""
-        return self._behind is not None
 
     def goes_on(self, stamp: int) -> bool:
         """Whether this stamp (ns) is newer than all that were told so."""

@@ -258,13 +258,13 @@ def gone(pids, seconds=1.0):
 class Backend:
     """The node as a process. folder: its data_dir; name: with its namespace."""
 
-    def __init__(self, start, folder, config, arguments, settings, namespace):
+    def __init__(self, start, folder, config, arguments, settings, namespace, seconds):
         self.folder, self.name = folder, f"{namespace}/slam_backend"
         words = ["run", "--data-dir", folder]
         words += ["--config", config] if config else []
         words += ["--namespace", namespace] if namespace else []
         words += [word for setting in settings for word in ("--set", setting)]
-        self.process = start("-m", "slam_backend", *words, "--", *arguments)
+        self.process = start("-m", "slam_backend", *words, "--", *arguments, seconds=seconds)
 
     @property
     def children(self):
@@ -319,8 +319,8 @@ class Backend:
 def backend(start, tmp_path):
     """`backend(config, ...)`: a node that is about to listen."""
 
-    def begin(config=None, *arguments, settings=(), namespace="", data="data"):
-        return Backend(start, tmp_path / data, config, arguments, settings, namespace)
+    def begin(config=None, *arguments, settings=(), namespace="", data="data", seconds=60):
+        return Backend(start, tmp_path / data, config, arguments, settings, namespace, seconds)
 
     return begin
 

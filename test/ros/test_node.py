@@ -107,7 +107,7 @@ def test_a_signal_while_it_starts_ends_it_too(backend, drive, moment) -> None:
 def test_the_warehouse_at_five_times_its_speed(backend, start, trouble) -> None:
     """The bag that ships with the package, by the package's own player, with three seconds of trouble in its midst."""
     config = WAREHOUSE.with_suffix(".yaml")
-    node = backend(config)
+    node = backend(config, seconds=250)
     player = start(
         "-m", "slam_backend", "play", WAREHOUSE, "--rate", 5, "--depth", 2000, "--wait", 20, "--json",
         "--topics", "/odom,/loops,/landmarks,/tf_static", seconds=200,

@@ -1,0 +1,146 @@
+"""Between topic and journal: jumps of a clock, sources that are found while their messages come."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+pytest.importorskip("rclpy")
+
+from slam_backend.core.config import Config
+from slam_backend.core.measurement import SECOND
+from slam_backend.io.encode import (
+    encode_cloud,
+    encode_odometry,
+    encode_pose_with_covariance,
+    encode_transforms,
+)
+from slam_backend.io.records import Record
+from slam_backend.io.typestore import typestore_of
+from slam_backend.ros import finder as module
+from slam_backend.ros.finder import Finder
+from slam_backend.ros.intake import Jumps
+
+START = 1_700_000_000 * SECOND
+ZEROS = np.zeros(36), np.zeros(6), np.zeros(36)
+POSE = (0, 0, 0, 0, 0, 0, 1)
+ODOMETRY = Record("/odom", "nav_msgs/msg/Odometry", 0, encode_odometry(START, "odom", "base", POSE, *ZEROS))
+LOOP = replace(
+    ODOMETRY,
+    topic="/loops",
+    data=encode_odometry(START, "base@5.000000000", "base@6.000000000", POSE, *ZEROS),
+)
+IN_MAP = Record(
+    "/localizer",
+    "geometry_msgs/msg/PoseWithCovarianceStamped",
+    0,
+    encode_pose_with_covariance(START, "map", POSE, ZEROS[0]),
+)
+TAGS = Record(
+    "/tags", "sensor_msgs/msg/PointCloud2", 0,
+    encode_cloud(START, "camera", {name: np.ones(2) for name in ("id", "x", "y", "z")}),
+)  # fmt: skip
+SCAN = replace(TAGS, topic="/scan", data=encode_cloud(START, "lidar", {name: np.ones(2) for name in "xyz"}))
+
+
+def transforms(parent, child):
+    return Record("/tf", "tf2_msgs/msg/TFMessage", 0, encode_transforms(START, parent, {child: POSE}))
+
+
+def jumps(*seconds):
+    seen = Jumps()
+    return [seen.jumped_back(round((1000 + s) * SECOND)) for s in seconds]
+
+
+@pytest.mark.parametrize(
+    "seconds",
+    [
+        (0, 1, 2, 3),
+        (0, 100, 101),  # a pause, or a jump ahead
+        (10, 9.5, 9.6, 9.7),  # late by less than a second
+        (10, 3, 10.1, 10.2),  # one odd stamp
+        (10, 3, 10.1, 3, 10.2, 3),  # again and again
+        (10, 3, 3, 3, 10.1),  # that does not move
+        (10, 5, 3, 10.1),  # nor goes on
+    ],
+)
+def test_what_is_no_jump_back(seconds) -> None:
+    assert not any(jumps(*seconds))
+
+
+def test_a_jump_is_told_once_by_the_second_message_after_it() -> None:
+    assert jumps(10, 11, 3, 3.1, 3.2, 4, 5) == [False, False, False, True, False, False, False]
+    assert jumps(10, 3, 3.1, 3.2, 1, 1.1) == [False, False, True, False, False, True]
+
+
+class Seen:
+    """A finder, and what it has made of all that it has seen."""
+
+    def __init__(self):
+        self.finder, self.config = Finder(typestore_of(())), Config()
+
+    def look(self, *records):
+        for record in records:
+            self.config = self.finder.look(record, self.config)
+        return {source.topic: source.kind for source in self.config.sources.values()}
+
+
+@pytest.fixture
+def seen():
+    return Seen()
+
+
+@pytest.fixture
+def impatient(monkeypatch):
+    """No topic waits for a better one."""
+    monkeypatch.setattr(module, "PATIENCE", {})
+    monkeypatch.setattr(module, "LONGEST", 0.0)
+
+
+def test_odometry_drives_at_once_and_brings_in_what_waited(seen) -> None:
+    assert seen.look(LOOP, TAGS, IN_MAP) == {}
+    assert all(seen.finder.wants(record) for record in (LOOP, TAGS, IN_MAP))
+    assert seen.look(ODOMETRY) == {"/odom": "odometry", "/tags": "landmark", "/localizer": "pose"}
+    assert seen.look(LOOP)["/loops"] == "relative"
+    assert seen.config.driver == "odom"
+
+
+def test_what_is_of_no_use_is_told_with_the_reason(seen) -> None:
+    truth, second = replace(ODOMETRY, topic="/ground_truth"), replace(ODOMETRY, topic="/odom2")
+    rubbish = replace(ODOMETRY, topic="/rubbish", data=b"\0\1\0\0")
+    assert seen.look(ODOMETRY, truth, second, SCAN, rubbish) == {"/odom": "odometry"}
+    assert seen.finder.unused == {
+        "/ground_truth": "it is taken for ground truth",
+        "/odom2": "'odom' is the odometry",
+        "/scan": "it holds nothing that could be used",
+        "/rubbish": "it holds nothing that could be used",
+    }
+    assert not any(seen.finder.wants(record) for record in (truth, second, SCAN, rubbish))
+
+
+def test_the_pair_on_tf_waits_for_better_odometry(seen) -> None:
+    pair = transforms("odom", "base")
+    assert seen.look(transforms("base", "wheel"), pair) == {}
+    assert seen.finder.wants(pair)
+    assert not seen.finder.wants(transforms("base", "wheel"))
+    assert seen.look(ODOMETRY, pair) == {"/odom": "odometry"}
+    assert not seen.finder.wants(pair)
+
+
+def test_after_a_while_the_pair_on_tf_serves(seen, impatient) -> None:
+    assert seen.look(transforms("base", "wheel"), transforms("odom", "base")) == {"/tf": "odometry"}
+
+
+def test_relative_poses_drive_when_nothing_else_does_and_give_way(seen, impatient) -> None:
+    assert seen.look(LOOP) == {"/loops": "relative"}
+    assert seen.config.driver == "loops"
+    assert seen.look(ODOMETRY) == {"/loops": "relative", "/odom": "odometry"}
+    assert seen.config.driver == "odom"
+
+
+def test_a_topic_that_is_called_like_a_setting_is_a_source_all_the_same(seen) -> None:
+    seen.look(replace(ODOMETRY, topic="/path"), replace(LOOP, topic="/sources"))
+    assert {name: source.topic for name, source in seen.config.sources.items()} == {
+        "path_": "/path",
+        "sources_": "/sources",
+    }
