@@ -1,12 +1,14 @@
-"""The kept factors, linearized at the final estimate: what the covariances of a finished run are computed from.
+"""The kept factors, linearized at the final estimate: what covariances and residuals of a finished run are computed from.
 
 graph.g2o cannot say all that they rest on: it has no line for gauges, absolute poses, robust weights and bearings. Here
-every factor is its whitened Jacobian, weight included, in a few flat arrays (linearized.npz):
+every factor is its whitened Jacobian and its whitened residual, robust weight included, in a few flat arrays (linearized.npz):
 
     indices   (N,) of the keyframes, in order of stamp, as in trajectory.tum
+    ids       (F,) of the factors                kinds    (F,) motion, loop, landmark, pose, gauge
     counts    (F,) variables of each factor      rows     (F,) rows of its Jacobian
     keys      (M,) those variables, all factors  columns  (M,) their dimensions
     numbers   the Jacobians one after the other, row by row
+    errors    the residuals one after the other; their squares sum to chi-square
 """
 
 import zlib
@@ -18,31 +20,37 @@ from zipfile import BadZipFile
 
 import gtsam
 import numpy as np
+from numpy.typing import NDArray
 
 from ..core.errors import BadFile, SolverFailure
 from ..core.graph import Factor, keyframe
 from ..core.measurement import Array
 from ..core.trajectory import Stamps
 
-ARRAYS = {"indices": "i", "counts": "i", "rows": "i", "keys": "u", "columns": "i", "numbers": "f"}
+ARRAYS = {"indices": "i", "counts": "i", "rows": "i", "keys": "u", "columns": "i", "numbers": "f",
+          "errors": "f", "ids": "U", "kinds": "U"}  # fmt: skip
+Strings = NDArray[np.str_]
 ADDABLE = 3  # variables of a factor that gtsam can make from matrices directly
 
 
 def write_linearized(path: Path, factors: Iterable[Factor], values: gtsam.Values, indices: Stamps) -> None:
     """factors: at `values`; inactive ones are left out."""
     sizes = values.zeroVectors()
-    linear = [each for factor in factors if (each := factor.factor.linearize(values)) is not None]
-    keys = [list(each.keys()) for each in linear]
-    jacobians = [each.jacobian()[0] for each in linear]
+    active = [(f, each) for f in factors if (each := f.factor.linearize(values)) is not None]
+    keys = [list(each.keys()) for _, each in active]
+    systems = [each.jacobian() for _, each in active]
     flat = [key for each in keys for key in each]
     np.savez_compressed(
         path,
         indices=indices,
         counts=np.array([len(each) for each in keys], dtype=np.int64),
-        rows=np.array([len(each) for each in jacobians], dtype=np.int64),
+        rows=np.array([len(errors) for _, errors in systems], dtype=np.int64),
         keys=np.array(flat, dtype=np.uint64),
         columns=np.array([len(sizes.at(key)) for key in flat], dtype=np.int64),
-        numbers=np.concatenate([np.zeros(0), *(each.ravel() for each in jacobians)]),
+        numbers=np.concatenate([np.zeros(0), *(jacobian.ravel() for jacobian, _ in systems)]),
+        errors=np.concatenate([np.zeros(0), *(errors for _, errors in systems)]),
+        ids=np.array([f.id for f, _ in active], dtype=np.str_),
+        kinds=np.array([f.kind for f, _ in active], dtype=np.str_),
     )
 
 
@@ -62,6 +70,36 @@ class Linearized:
             raise BadFile(f"{path}: is damaged: its arrays are not those of a run")
         self.indices: Stamps = arrays["indices"]
         self._arrays = arrays
+
+    @property
+    def ids(self) -> Strings:
+        """(F,) of the factors."""
+        return np.asarray(self._arrays["ids"])
+
+    @property
+    def kinds(self) -> Strings:
+        """(F,) of the factors."""
+        return np.asarray(self._arrays["kinds"])
+
+    @cached_property
+    def keys(self) -> list[list[int]]:
+        """The variables of each factor."""
+        self._fits()
+        ends = np.cumsum(self._arrays["counts"])
+        return [each.tolist() for each in np.split(self._arrays["keys"], ends[:-1])] if len(ends) else []
+
+    @property
+    def rows(self) -> Stamps:
+        """(F,) degrees of freedom that each factor measures."""
+        return np.asarray(self._arrays["rows"])
+
+    @cached_property
+    def chi_squares(self) -> Array:
+        """(F,) of the factors at the final estimate, robust weights included."""
+        self._fits()
+        ends = np.cumsum(self.rows)
+        squares = np.concatenate([[0.0], np.cumsum(self._arrays["errors"] ** 2)])
+        return np.asarray(squares[ends] - squares[ends - self.rows])
 
     def covariance(self, index: int) -> Array:
         """Marginal covariance of a keyframe's pose at its tangent. SolverFailure if the factors do not determine it."""
@@ -89,14 +127,9 @@ class Linearized:
 
     def _factors(self) -> Iterator[tuple[list[tuple[int, Array]], int]]:
         """(variable, its block) of each factor, and the number of rows."""
-        counts, rows, keys, columns, numbers = (self._arrays[name] for name in list(ARRAYS)[1:])
-        whole = len(counts) == len(rows) and counts.sum() == len(keys) == len(columns)
+        self._fits()
+        counts, rows, keys, columns, numbers = (self._arrays[name] for name in list(ARRAYS)[1:6])
         ends = np.cumsum(counts)
-        if whole and len(counts):
-            widths = np.add.reduceat(columns, ends - counts)
-            whole = bool((counts > 0).all()) and int((widths * rows).sum()) == len(numbers)
-        if not whole:
-            raise BadFile(f"{self._path}: is damaged: its arrays do not fit together")
         at = 0
         keys, columns = keys.tolist(), columns.tolist()
         for end, count, height in zip(ends.tolist(), counts.tolist(), rows.tolist(), strict=True):
@@ -105,3 +138,15 @@ class Linearized:
             at += block.size
             parts = np.split(block, np.cumsum(sizes[:-1]), axis=1)
             yield list(zip(keys[end - count : end], parts, strict=True)), height
+
+    def _fits(self) -> None:
+        counts, rows, keys, columns, numbers, errors, ids, kinds = (
+            self._arrays[name] for name in list(ARRAYS)[1:]
+        )
+        whole = len({len(each) for each in (counts, rows, ids, kinds)}) == 1
+        whole = whole and counts.sum() == len(keys) == len(columns) and rows.sum() == len(errors)
+        if whole and len(counts):
+            widths = np.add.reduceat(columns, np.cumsum(counts) - counts)
+            whole = bool((counts > 0).all()) and int((widths * rows).sum()) == len(numbers)
+        if not whole:
+            raise BadFile(f"{self._path}: is damaged: its arrays do not fit together")

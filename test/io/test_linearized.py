@@ -94,3 +94,16 @@ def test_damage_is_one_line_that_names_the_file(tmp_path: Path) -> None:
         Linearized(path)
     with pytest.raises(BadFile, match="cannot be read: No such file"):
         Linearized(tmp_path / "none.npz")
+
+
+def test_the_residuals_are_those_of_the_factors(tmp_path: Path) -> None:
+    factors, values = inertial()
+    write_linearized(tmp_path / "a.npz", factors, values, np.arange(2))
+    found = Linearized(tmp_path / "a.npz")
+    assert found.ids.tolist() == [each.id for each in factors]
+    assert found.keys == [list(each.keys) for each in factors]
+    assert found.rows.tolist() == [15, 6, 6, 3, 6]
+    plain = [2 * each.factor.error(values) for each in factors]
+    np.testing.assert_allclose(np.delete(found.chi_squares, 1), np.delete(plain, 1), rtol=1e-9, atol=1e-9)
+    distance = (0.5**2 + 0.1**2 + 0.2**2 + 0.2**2) / 0.01**2  # of the edge that a kernel of Cauchy weakens
+    np.testing.assert_allclose(found.chi_squares[1], distance / (1 + distance), rtol=0.05)
