@@ -1,6 +1,6 @@
 """The way of a change: into the solver, whole; without what cannot be solved; with the parts that it connects."""
 
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -24,9 +24,21 @@ class Applier:
     sets of first guesses for variables that exist, so that the solver starts near the answer.
     """
 
-    def __init__(self, solver: Solver, space: Space, parts: Parts, wake: Callable[[int], None]) -> None:
-        """wake: called with the key of each new landmark, and with UNTIL_JOINED when two parts become one."""
+    def __init__(
+        self,
+        solver: Solver,
+        space: Space,
+        parts: Parts,
+        wake: Callable[[int], None],
+        booked: Callable[[Delta], None] = lambda _: None,
+    ) -> None:
+        """wake: called with the key of each new landmark, and with UNTIL_JOINED when two parts become one.
+
+        booked: called with every change that the solver has taken.
+        """
         self._solver, self._space, self._parts, self._wake = solver, space, parts, wake
+        self._booked = booked
+        self._verdicts: Mapping[str, Decision] = {}
         self.estimate: Estimate | None = None
         self.sighted: dict[
             int, tuple[int, Array]
@@ -37,8 +49,12 @@ class Applier:
         taken, self.decisions = self.decisions, []
         return taken
 
-    def apply(self, delta: Delta) -> None:
-        """SolverFailure when not even the motion can be solved; nothing of the change is in the graph then."""
+    def apply(self, delta: Delta, verdicts: Mapping[str, Decision] | None = None) -> None:
+        """SolverFailure when not even the motion can be solved; nothing of the change is in the graph then.
+
+        verdicts: by id, why a factor may enter; told of those that the solver takes.
+        """
+        self._verdicts = verdicts or {}
         while (event := next((f for f in delta.add if self._connects(f)), None)) is not None:
             before, delta = _split(delta, event)
             self._solve(before)
@@ -125,7 +141,8 @@ class Applier:
                 self.sighted[key] = (factor.keys[0], self._from(factor.keys[0], delta, key))
                 self._wake(key)
             if factor.kind in ("loop", "pose"):
-                self.decisions.append(_accepted(factor))
+                self.decisions.append(self._verdicts.get(factor.id) or _accepted(factor))
+        self._booked(delta)
 
     def _from(self, pose_key: int, delta: Delta, key: int) -> Array:
         """The first guess of a landmark, seen from a pose."""

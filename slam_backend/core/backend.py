@@ -2,7 +2,7 @@
 
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import gtsam
@@ -28,7 +28,8 @@ from .keyframes import Timeline, Track, due
 from .measurement import Array, Measurement, StaticTransform
 from .mounts import Mounts
 from .parts import Parts
-from .robust import Robust
+from .robust import ROBUST, Robust
+from .robust.paths import Paths
 from .sensors import SENSORS
 from .sensors.odometry import OdometryPose
 from .settle import FAR
@@ -68,13 +69,18 @@ class Backend:
     """
 
     def __init__(
-        self, config: Config | None = None, solver: Solver | None = None, robust: Sequence[Robust] = ()
+        self,
+        config: Config | None = None,
+        solver: Solver | None = None,
+        robust: Sequence[Robust] | None = None,
     ) -> None:
+        """solver, robust: instead of those that the config names."""
         config = config or Config()
         self.config = config = config if config.sources else config.model_copy(update={"sources": SOURCES})
         self.space = space = SPACES[config.space]
         self.solver = solver or SOLVERS["isam2"](config, space)
-        self._robust = robust
+        paths = Paths(space, config.gate.odometry_scale, self.solver.factors)
+        self._robust = [ROBUST[name](config, paths) for name in config.robust] if robust is None else robust
         self._driver = config.driver
         if self._driver is None:
             raise BadConfig("no source drives the keyframes: add one of kind odometry or relative")
@@ -91,7 +97,8 @@ class Backend:
         self._growth = Growth(space, self.timeline, self.track, self.parts)
         self._decisions: list[Decision] = []  # told with the next update
         self._newest: tuple[Keyframe, Pose] | None = None  # and its odometry pose
-        self._applier = Applier(self.solver, space, self.parts, self._waiting.wake)
+        book = paths.book if self._robust else lambda _: None
+        self._applier = Applier(self.solver, space, self.parts, self._waiting.wake, book)
         self._revision = 0
 
     def add(self, measurement: Measurement) -> list[Update]:
@@ -285,14 +292,33 @@ class Backend:
         return [self._told(b, delta.values.get(b.pose))] if self.timeline.at(b.stamp) is b else []
 
     def _judge(self, proposed: Delta) -> None:
-        for stage in self._robust:
-            proposed, decisions = stage.admit(proposed, self.estimate)
-            self._decisions += decisions
-        self._applier.apply(touched(proposed))
+        self._admit(proposed, self._robust)
         for stage in self._robust:
             amendment, decisions = stage.review(self.estimate)
-            self._decisions += decisions
-            self._applier.apply(amendment)
+            added = {factor.id for factor in amendment.add}
+            self._decisions += [each for each in decisions if each.id not in added]
+            others = [other for other in self._robust if other is not stage]
+            self._admit(amendment, others, {each.id: each for each in decisions if each.id in added})
+
+    def _admit(
+        self, proposed: Delta, stages: Sequence[Robust], passed: Mapping[str, Decision] | None = None
+    ) -> None:
+        """Through the stages, then into the graph. passed: why factors have come so far, by id."""
+        passed = dict(passed or {})
+        for stage in stages:
+            if not proposed.add:
+                break
+            proposed, decisions = stage.admit(proposed, self.estimate)
+            kept = {factor.id for factor in proposed.add}
+            for each in decisions:
+                before = passed.get(each.id)
+                told = replace(each, basis={**before.basis, **each.basis}) if before else each
+                if each.id in kept:
+                    passed[each.id] = told
+                else:
+                    self._decisions.append(told)
+        self._applier.apply(touched(proposed), passed)
+        self._decisions += self._applier.take_decisions()  # in the order in which they were made
 
     def _give_up(self, delta: Delta, new: Sequence[Keyframe], window: Sequence[Offer]) -> None:
         """Not even the motion could be solved: the keyframes are taken back. The next one spans the gap, and takes what

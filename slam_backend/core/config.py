@@ -21,6 +21,7 @@ from .errors import BadConfig
 LIVE: dict[str, Any] = {"live": True}  # settings that a running node takes; all others are read-only there
 
 KernelName = Literal["none", "huber", "cauchy", "tukey", "geman_mcclure", "dcs"]
+StageName = Literal["gate", "witness"]
 
 
 class Section(BaseModel):
@@ -66,6 +67,17 @@ class Isam2(Section):
     )
     factorization: Literal["auto", "cholesky", "qr"] = Field(
         default="auto", description="auto: Cholesky, and QR for the rest of the run once Cholesky has failed"
+    )
+
+
+class Gate(Section):
+    """Refuses a loop that contradicts the cheapest path between its ends, through odometry and accepted loops."""
+
+    odometry_scale: float = Field(
+        3.0,
+        gt=0,
+        le=1000,
+        description="what the odometry's standard deviations are multiplied by: stated noise leaves out bias and correlation",
     )
 
 
@@ -176,6 +188,10 @@ class Config(Section):
     keyframes: Keyframes = Keyframes()
     settle: Settle = Settle()
     isam2: Isam2 = Isam2()
+    gate: Gate = Gate()
+    robust: tuple[StageName, ...] = Field(
+        (), description="what judges loops before they enter the graph, in this order; empty: nothing does"
+    )
     map_frame: str = Field(
         "map", description="name of the frame of the optimized trajectory, in what the node publishes"
     )
@@ -204,6 +220,8 @@ class Config(Section):
                 raise ValueError(f"source name '{name}' must not be empty or contain '/' or '@'")
             if name in Config.model_fields or name == "gauge":
                 raise ValueError(f"a source cannot be called '{name}': that name has a meaning of its own")
+        if len(set(self.robust)) < len(self.robust):
+            raise ValueError(f"'robust' names '{max(self.robust, key=self.robust.count)}' twice")
         if self.sources and self.driver is None:
             raise ValueError("no source drives the keyframes: add one of kind odometry or relative")
         return self

@@ -77,6 +77,8 @@ def as_json(decision: Decision) -> dict[str, Any]:
     }
     if decision.ends is not None:
         line["a"], line["b"] = (format_stamp(stamp) for stamp in decision.ends)
+    if decision.basis:
+        line["basis"] = dict(decision.basis)
     if decision.count > 1:
         line["count"] = decision.count
     return line

@@ -81,6 +81,7 @@ class Decision:
 
     verdict, stage, reason: `stage/reason` is the rule; `detail` a sentence for people.
     statistic, threshold: the number that was compared, where there was one.
+    basis: what else it rested on, by name: plain numbers, texts, lists and mappings.
     """
 
     stamp: int
@@ -94,6 +95,7 @@ class Decision:
     threshold: float | None = None
     ends: tuple[int, int] | None = None  # the two stamps of a relative measurement
     count: int = 1  # how many records of one second it stands for
+    basis: Mapping[str, Any] = field(default_factory=dict, hash=False)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

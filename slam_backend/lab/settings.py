@@ -55,6 +55,8 @@ def _table(model: type[BaseModel], skip: Collection[str] = ()) -> Iterator[str]:
 
 def _default(field: FieldInfo) -> str:
     value: Any = field.get_default(call_default_factory=True)
+    if isinstance(value, tuple):
+        return f"`[{', '.join(value)}]`"
     return "none" if value is None else f"`{str(value).lower() if isinstance(value, bool) else value or '-'}`"
 
 
