@@ -3,13 +3,7 @@
 A test here runs only where rclpy is installed; a module that imports it on top begins with `pytest.importorskip("rclpy")`.
 """
 
-import json
-import os
-import signal
-import subprocess
-import sys
 import time
-from contextlib import suppress
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
@@ -17,24 +11,11 @@ from typing import NamedTuple
 
 import pytest
 
-DOMAINS = range(1, 102)  # whose ports lie below those that Linux gives to others
+from bench.process import Backend, Processes, own_network
+
 AGAIN = 5.0  # s after which an unanswered request is repeated
-PORTS = 250  # of one domain, from 7400 on
 
-
-def free_domain() -> int:
-    """A domain on whose ports nobody listens; runs at the same time begin to look at different ones."""
-    lines = Path("/proc/net/udp").read_text().splitlines()[1:] if Path("/proc/net/udp").exists() else []
-    taken = {(int(line.split()[1].rpartition(":")[2], 16) - 7400) // PORTS for line in lines}
-    first = os.getpid() % len(DOMAINS)
-    return next((d for d in (*DOMAINS[first:], *DOMAINS[:first]) if d not in taken), DOMAINS[first])
-
-
-os.environ["ROS_DOMAIN_ID"] = str(free_domain())
-os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
-os.environ["ROS_PYTHON_CHECK_FIELDS"] = (
-    "1"  # otherwise a wrong type in a message field is scrambled, not refused
-)
+own_network()
 
 
 @pytest.fixture(autouse=True)
@@ -44,95 +25,17 @@ def _rclpy():
         pytest.skip("rclpy is not installed")
 
 
-class Process:
-    """A python process whose output is kept and whose time is bounded."""
-
-    def __init__(self, arguments: tuple[str, ...], log: Path, seconds: float, environment: dict[str, str]):
-        self._log = log
-        # --foreground: a signal to `timeout` reaches python once, not twice
-        command = ["timeout", "--foreground", "-k", "5", str(seconds), sys.executable, "-u", *arguments]
-        with log.open("wb") as output:
-            self._timeout = subprocess.Popen(
-                command,
-                stdin=subprocess.DEVNULL, stdout=output, stderr=subprocess.STDOUT,
-                env=os.environ | environment, start_new_session=True,
-            )  # fmt: skip
-        self.pid = self._child()  # of python itself; 0 if it has ended already
-
-    def _child(self) -> int:
-        pid = self._timeout.pid
-        children = Path(f"/proc/{pid}/task/{pid}/children")
-        while self._timeout.poll() is None:
-            if found := children.read_text().split():
-                return int(found[0])
-            time.sleep(0.005)
-        return 0
-
-    @property
-    def alive(self) -> bool:
-        return self._timeout.poll() is None
-
-    @property
-    def cpu_seconds(self) -> float:
-        """That python has used, in user and system."""
-        ticks = Path(f"/proc/{self.pid}/stat").read_text().rpartition(")")[2].split()[11:13]
-        return sum(map(int, ticks)) / os.sysconf("SC_CLK_TCK")
-
-    @property
-    def output(self) -> str:
-        """Standard output and errors so far."""
-        return self._log.read_text(errors="replace")
-
-    def wait_for(self, text: str, seconds: float = 20) -> str:
-        """The first whole line of output that contains the text; fails with the output if there is none in time."""
-        until = time.monotonic() + seconds
-        while True:
-            alive = self.alive  # asked before reading: what a process said before its end counts
-            for line in self.output.splitlines(keepends=True):
-                if text in line and (line.endswith("\n") or not alive):
-                    return line.rstrip("\n")
-            assert alive, f"ended without saying '{text}':\n{self.output}"
-            assert time.monotonic() < until, f"'{text}' was not said in {seconds} s:\n{self.output}"
-            time.sleep(0.02)
-
-    def signal(self, number: int) -> None:
-        """To python itself; SIGSTOP and SIGCONT too."""
-        if self.alive and self.pid:
-            with suppress(ProcessLookupError):
-                os.kill(self.pid, number)
-
-    def wait(self, seconds: float = 10) -> int:
-        """The exit code once it ends by itself; minus the signal's number if one killed it."""
-        try:
-            code = self._timeout.wait(seconds)
-        except subprocess.TimeoutExpired:
-            raise AssertionError(f"still alive after {seconds} s:\n{self.output}") from None
-        return 128 - code if code > 128 else code
-
-    def end(self, seconds: float = 5) -> int:
-        """Ask with SIGINT, then insist with SIGKILL; the exit code."""
-        self.signal(signal.SIGCONT)
-        self.signal(signal.SIGINT)
-        try:
-            return self.wait(seconds)
-        except AssertionError:
-            self.signal(signal.SIGKILL)
-            return self.wait(5)
+@pytest.fixture
+def processes(tmp_path):
+    """Where processes are started; all have ended with the test at the latest."""
+    with Processes(tmp_path) as processes:
+        yield processes
 
 
 @pytest.fixture
-def start(tmp_path):
-    """`start("-c", code)` or `start("-m", "slam_backend", ...)`: a Process of this python, ended with the test at the latest."""
-    started: list[Process] = []
-
-    def begin(*arguments: object, seconds: float = 60, **environment: str) -> Process:
-        log = tmp_path / f"process{len(started)}.log"
-        started.append(Process(tuple(map(str, arguments)), log, seconds, environment))
-        return started[-1]
-
-    yield begin
-    for process in started:
-        process.end()
+def start(processes):
+    """`start("-c", code)` or `start("-m", "slam_backend", ...)`: a Process of this python."""
+    return processes.start
 
 
 @pytest.fixture
@@ -239,88 +142,12 @@ def peer(context):
     peer.node.destroy_node()
 
 
-def gone(pids, seconds=1.0):
-    """Whether these processes end by themselves in time; one that nobody has buried yet has ended."""
-
-    def lives(pid):
-        with suppress(OSError):
-            return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
-        return False
-
-    end = time.monotonic() + seconds
-    while any(map(lives, pids)):
-        if time.monotonic() > end:
-            return False
-        time.sleep(0.02)
-    return True
-
-
-class Backend:
-    """The node as a process. folder: its data_dir; name: with its namespace."""
-
-    def __init__(self, start, folder, config, arguments, settings, namespace, seconds):
-        self.folder, self.name = folder, f"{namespace}/slam_backend"
-        words = ["run", "--data-dir", folder]
-        words += ["--config", config] if config else []
-        words += ["--namespace", namespace] if namespace else []
-        words += [word for setting in settings for word in ("--set", setting)]
-        self.process = start("-m", "slam_backend", *words, "--", *arguments, seconds=seconds)
-
-    @property
-    def children(self):
-        """Command lines of its processes, by pid."""
-        pid, found = self.process.pid, {}
-        for task in Path(f"/proc/{pid}/task").glob("*/children"):
-            with suppress(OSError):
-                for child in task.read_text().split():
-                    found[int(child)] = Path(f"/proc/{child}/cmdline").read_text().replace("\0", " ")
-        return found
-
-    def worker(self, seconds=10.0):
-        """The pid of the process that solves."""
-        end = time.monotonic() + seconds
-        while time.monotonic() < end:
-            for pid, command in self.children.items():
-                with suppress(OSError):
-                    maps = Path(f"/proc/{pid}/maps").read_text()
-                    if "spawn_main" in command and "gtsam" in maps and "_rclpy" not in maps:
-                        return pid
-            time.sleep(0.05)
-        raise AssertionError(f"there is no worker:\n{self.process.output}")
-
-    def end(self, number=signal.SIGINT, seconds=20.0):
-        """Its summary; it must end well, leave nobody behind and print no traceback."""
-        children = self.children
-        self.process.signal(number)
-        code = self.process.wait(seconds)
-        assert code == 0, self.process.output
-        assert "Traceback" not in self.process.output, self.process.output
-        assert "Failed to publish" not in self.process.output, self.process.output
-        assert gone(children)
-        return self.summary
-
-    def is_alone(self, pids):
-        """Whether none of these processes of its outlived it."""
-        return gone(pids)
-
-    @property
-    def summary(self):
-        return json.loads((self.folder / "run" / "summary.json").read_text())
-
-    def replayed(self, session=""):
-        """What replay makes of the journal with the configuration that the run was saved with."""
-        import slam_backend as sb
-
-        config = sb.load_config(self.folder / f"run{session}" / "config.yaml")
-        return sb.replay(self.folder / f"journal{session}.db3", config).result.summary
-
-
 @pytest.fixture
-def backend(start, tmp_path):
+def backend(processes, tmp_path):
     """`backend(config, ...)`: a node that is about to listen."""
 
-    def begin(config=None, *arguments, settings=(), namespace="", data="data", seconds=60):
-        return Backend(start, tmp_path / data, config, arguments, settings, namespace, seconds)
+    def begin(config=None, *arguments, data="data", **options):
+        return Backend(processes, tmp_path / data, config, *arguments, **options)
 
     return begin
 

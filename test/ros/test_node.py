@@ -3,7 +3,6 @@
 import json
 import os
 import signal
-import sqlite3
 import time
 from pathlib import Path
 
@@ -13,25 +12,15 @@ import pytest
 pytest.importorskip("rclpy")
 
 import slam_backend as sb
+from bench.process import stopped
 
-LOAD = Path(__file__).parent / "load.py"
+LOAD = Path(__file__).parents[2] / "bench" / "load.py"
 WAREHOUSE = Path(__file__).parents[2] / "bags" / "warehouse.mcap"
 ODOMETRY = "nav_msgs/msg/Odometry"
 
 
 def replayed(drive):
     return sb.replay(drive.bag, sb.load_config(drive.config)).result.summary
-
-
-def stopped(pid, seconds):
-    """Stop a process for a while, in the midst of what it does."""
-
-    def act():
-        os.kill(pid(), signal.SIGSTOP)
-        time.sleep(seconds)
-        os.kill(pid(), signal.SIGCONT)
-
-    return act
 
 
 def test_what_runs_live_is_what_replay_computes(backend, peer, drive) -> None:
@@ -142,10 +131,11 @@ def test_at_the_rates_of_a_robot_nothing_is_lost(backend, start, hz, loops, stal
     """The journal has every message, though the worker stands still for a while; ~/odometry does not wait for the solver."""
     sources = ["wheels={kind: odometry, topic: /odom}", "loops={kind: relative, topic: /loops}"]
     node = backend(None, settings=["space=2d", "sources=[wheels,loops]", *sources])
-    hearing = start(LOAD, "hear", "/slam_backend/odometry")
+    hearing = start(LOAD, "hear", "/slam_backend/odometry", ODOMETRY)
     hearing.wait_for("ready")
-    sending = start(LOAD, "send", hz, 12, loops)
+    sending = start(LOAD, "send", 5)
     sending.wait_for("matched")
+    sending.tell(f"{hz} 10 12 {loops}")
     if stall:
         time.sleep(2)
         stopped(node.worker, stall)()
@@ -155,10 +145,10 @@ def test_at_the_rates_of_a_robot_nothing_is_lost(backend, start, hz, loops, stal
     assert np.median(medians) < 10  # ms
     assert hz > 200 or np.median(tails) < 20
     summary = node.end()
-    journal = sqlite3.connect(node.folder / "journal.db3")
-    rows = dict(
-        journal.execute("SELECT t.name, count(*) FROM messages m JOIN topics t ON t.id = topic_id GROUP BY 1")
+    assert (
+        node.rows()
+        == {"/odom": int(odometry), "/loops": int(told)}
+        == {"/odom": hz * 12, "/loops": int(told)}
     )
-    assert rows == {"/odom": int(odometry), "/loops": int(told)} == {"/odom": hz * 12, "/loops": int(told)}
     assert summary["counts"]["records"] == hz * 12 + int(told)
     assert summary["run_hash"] == node.replayed()["run_hash"]
