@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
+from ..core.errors import BadConfig
 from .progress import progress
 
 if TYPE_CHECKING:
@@ -31,6 +32,10 @@ def command(
     final: Annotated[
         Literal["none", "batch"], typer.Option(help="batch: end at the optimum of the kept factors.")
     ] = "none",
+    estimator: Annotated[
+        Literal["isam2", "ekf"],
+        typer.Option(help="isam2: the smoother; ekf: a filter over the same factors, to compare with."),
+    ] = "isam2",
     out: Annotated[Path | None, typer.Option(metavar="DIR", help="Default: runs/NAME of the input.")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print the summary as JSON.")] = False,
 ) -> None:
@@ -38,11 +43,16 @@ def command(
     from ..io.configfile import load_config
     from ..io.replay import replay
     from ..io.rundir import PICTURE, prepare, write_run
+    from ..lab.ekf import ESTIMATORS
     from ..lab.picture import draw
 
+    if final == "batch" and estimator != "isam2":
+        raise BadConfig("--final batch: a filter has no batch solution; leave it out, or --estimator")
     target = out or Path("runs") / inputs[0].stem
     prepare(target)
-    run = replay(inputs, load_config(config) if config else None, settings or (), final)
+    run = replay(
+        inputs, load_config(config) if config else None, settings or (), final, ESTIMATORS[estimator]
+    )
     _watch(run)
     write_run(run.result, target)
     draw(run.result, target / PICTURE)

@@ -2,7 +2,7 @@
 
 import platform
 import resource
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from importlib.metadata import PackageNotFoundError, version
@@ -22,13 +22,16 @@ from ..core.fingerprint import run_hash
 from ..core.graph import Decision, Factor
 from ..core.measurement import SECOND, Measurement
 from ..core.settle import settled
+from ..core.solvers import SOLVERS, Solver
 from ..core.solvers.batch import Solution, polish
+from ..core.space import SPACES, Space
 from ..core.trajectory import Snapshot, Trajectory
 from .configfile import configured
 from .discover import discover
 from .inputs import Inputs, open_inputs
 
 Final = Literal["none", "batch"]
+Estimator = Callable[[Config, Space], Solver]
 RECENT = 500  # updates
 VERSIONS = ("slam_backend", "gtsam", "numpy", "rosbags")
 
@@ -38,11 +41,13 @@ def replay(
     config: Config | None = None,
     settings: Sequence[str] = (),
     final: Final = "none",
+    estimator: Estimator = SOLVERS["isam2"],
 ) -> "Run":
     """Replay bags, journals or a pose graph. Iterate the Run for its updates, or ask for its `result`.
 
     config: without one, or without sources in it, these are found by the types of the topics. settings: `key=value`, applied
-    to what was found. final: `batch` ends at the optimum of the kept factors. SlamError says what is wrong with the input.
+    to what was found. final: `batch` ends at the optimum of the kept factors. estimator: makes the solver that takes the
+    factors. SlamError says what is wrong with the input.
     """
     paths = [inputs] if isinstance(inputs, Path | str) else list(inputs)
     opened = open_inputs(paths)
@@ -55,7 +60,7 @@ def replay(
             given = {} if config is None else config.model_dump(exclude_unset=True, exclude={"sources"})
             config = config_from({**config_to(found), **given}, "configuration")
         config = configured(config, settings)
-        return Run(opened, config, notes, final)
+        return Run(opened, config, notes, final, estimator)
     except BaseException:
         opened.close()
         raise
@@ -74,11 +79,18 @@ def settled_stream(
 class Run:
     """One replay. An iterator of updates; progress, early stop and fleets wrap it from outside."""
 
-    def __init__(self, inputs: Inputs, config: Config, notes: list[str], final: Final = "none") -> None:
+    def __init__(
+        self,
+        inputs: Inputs,
+        config: Config,
+        notes: list[str],
+        final: Final = "none",
+        estimator: Estimator = SOLVERS["isam2"],
+    ) -> None:
         self.config, self.notes, self.inputs = config, notes, inputs
         self._final = final
         self.batch: Solution | None = None
-        self.backend = Backend(config)
+        self.backend = Backend(config, estimator(config, SPACES[config.space]))
         self.decisions = DecisionLog()
         self.seconds = Seconds()
         self.measurements = 0
@@ -209,6 +221,7 @@ class Result:
             "run_hash": run_hash(self.factors, self.decisions, self.values, self.trajectory.sevens),
             "config_hash": config_hash(run.config),
             "seed": 0,
+            "estimator": run.backend.solver.name,
             "counts": {
                 "records": run.inputs.read,
                 "measurements": run.measurements,

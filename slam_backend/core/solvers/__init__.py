@@ -10,6 +10,8 @@ from . import isam2
 
 
 class Solver(Protocol):
+    name: str  # as summary.json tells it
+
     @property
     def factors(self) -> Mapping[str, Factor]:
         """The store: what is in the graph now, by id."""

@@ -44,6 +44,8 @@ class Unsettled(
 
 
 class Isam2:
+    name = "isam2"
+
     def __init__(self, config: Config, space: Space) -> None:
         self._config, self._space = config.isam2, space
         self._qr = config.isam2.factorization == "qr"
