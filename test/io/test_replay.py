@@ -53,6 +53,16 @@ def test_two_replays_are_equal_to_the_bit(drive):
     assert first.summary["counts"]["loops_accepted"] > 10
 
 
+def test_to_look_changes_nothing(drive):
+    """What is asked on the way, a snapshot or a covariance, leaves no trace in what follows."""
+    run = replay(*drive)
+    for n, update in enumerate(run):
+        if n % 3 == 0:
+            run.backend.snapshot()
+            run.backend.estimate.covariance([update.keyframe.pose])
+    assert run.result.summary["run_hash"] == hash_of(*drive)
+
+
 def test_another_process_gives_the_same_hash(drive, tmp_path):
     bag, config = drive
     code = (

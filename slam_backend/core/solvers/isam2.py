@@ -268,7 +268,10 @@ class Believed:
         return bool(self._isam.valueExists(key))
 
     def values(self) -> gtsam.Values:
-        return self._isam.calculateBestEstimate()  # a whole back-substitution: no wildfire threshold
+        """A whole back-substitution, without wildfire threshold. Of a copy: iSAM2 keeps the steps that it computes, and when it
+        linearizes next depends on them, so that to look would change what follows.
+        """
+        return gtsam.ISAM2(self._isam).calculateBestEstimate()
 
     def covariance(self, keys: Sequence[int]) -> Array:
         try:
