@@ -31,7 +31,7 @@ setup(
         (f"lib/{NAME}", ["resource/backend"]),  # where `ros2 run` looks
     ],
     zip_safe=False,
-    entry_points={"console_scripts": ["slam-backend = slam_backend.cli:main"]},
+    entry_points={"console_scripts": ["slam-backend = slam_backend.__main__:main"]},
     install_requires=[
         "gtsam>=4.3,<4.4",  # 4.2 ends the process in marginalCovariance on long chains
         "matplotlib",

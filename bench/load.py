@@ -1,7 +1,8 @@
 """What a robot and its clients do to a node, each as a process of its own:
 
-`load.py send RADIUS`: for each line `HZ SPEED SECONDS LOOPS_PER_S` on its input, odometry of a drive on a circle, stamped when it is
-published, and loops with the round before. Says `matched` when the node listens, and `sent N odometry M loops` after each line.
+`load.py send RADIUS [at_once]`: for each line `HZ SPEED SECONDS LOOPS_PER_S` on its input, odometry of a drive on a circle, stamped when it is
+published, and loops with the round before. Says `matched` when the node listens, or at once, and `sent N odometry M loops` after each line.
+`load.py watch`: says `queue N keyframes K` as often as the diagnostics do.
 `load.py hear TOPIC TYPE`: says `ready`, `first AT`, and at its end one line of JSON: [stamp in ns, latency in ms] of each message.
 `load.py ask get_trajectory|query SECONDS`: again and again; then one line of JSON: [number of values in the answer, seconds] of each.
 `load.py draw POSES TIMES`: ~/path of so many poses; one line of JSON: milliseconds to build and publish each.
@@ -11,6 +12,7 @@ import json
 import sys
 import time
 from bisect import bisect_left
+from contextlib import suppress
 from importlib import import_module
 from math import cos, pi, sin
 from struct import unpack_from
@@ -67,6 +69,8 @@ class Drive:
         self.odometry, self.loops = (
             node.create_publisher(class_of(ODOMETRY), topic, profile) for topic in ("/odom", "/loops")
         )
+
+    def wait(self):
         wait_until(lambda: self.odometry.get_subscription_count() and self.loops.get_subscription_count())
 
     def go(self, hz, speed, seconds, loops):
@@ -98,14 +102,16 @@ class Drive:
         return True
 
 
-def send(radius):
+def send(radius, at_once=""):
     drive = Drive(float(radius))
+    if not at_once:
+        drive.wait()
     say("matched")
     for line in sys.stdin:
         drive.go(*map(float, line.split()))
 
 
-# -- hear, ask, draw ---------------------------------------------------------------------------------
+# -- watch, hear, ask, draw ---------------------------------------------------------------------------------
 
 
 def hear(topic, type_):
@@ -126,6 +132,19 @@ def hear(topic, type_):
     except (KeyboardInterrupt, ExternalShutdownException):
         rclpy.try_shutdown()
     say(json.dumps(heard))
+
+
+def watch():
+    node = rclpy.create_node("watch")
+
+    def take(message):
+        (values,) = (status.values for status in message.status if status.name == "slam_backend: solver")
+        told = {value.key: value.value for value in values}
+        say(f"queue {told.get('queue')} keyframes {told.get('keyframes')}")
+
+    node.create_subscription(class_of("diagnostic_msgs/msg/DiagnosticArray"), "/diagnostics", take, 10)
+    with suppress(KeyboardInterrupt, ExternalShutdownException):
+        rclpy.spin(node)
 
 
 def ask(service, seconds):
@@ -171,4 +190,4 @@ def draw(poses, times):
 
 if __name__ == "__main__":
     rclpy.init()
-    {"send": send, "hear": hear, "ask": ask, "draw": draw}[sys.argv[1]](*sys.argv[2:])
+    {"send": send, "watch": watch, "hear": hear, "ask": ask, "draw": draw}[sys.argv[1]](*sys.argv[2:])

@@ -20,17 +20,17 @@ PORTS = 250  # of one domain, from 7400 on
 
 def own_network() -> None:
     """This process and those that it starts: a domain on this machine that nobody else uses; wrong types in messages are refused."""
-    os.environ["ROS_DOMAIN_ID"] = str(free_domain())
+    os.environ["ROS_DOMAIN_ID"] = str(free_domains()[0])
     os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
     os.environ["ROS_PYTHON_CHECK_FIELDS"] = "1"  # otherwise they are scrambled
 
 
-def free_domain() -> int:
-    """A domain on whose ports nobody listens; runs at the same time begin to look at different ones."""
+def free_domains() -> list[int]:
+    """Those on whose ports nobody listens; runs at the same time begin to look at different ones."""
     lines = Path("/proc/net/udp").read_text().splitlines()[1:] if Path("/proc/net/udp").exists() else []
     taken = {(int(line.split()[1].rpartition(":")[2], 16) - 7400) // PORTS for line in lines}
     first = os.getpid() % len(DOMAINS)
-    return next((d for d in (*DOMAINS[first:], *DOMAINS[:first]) if d not in taken), DOMAINS[first])
+    return [domain for domain in (*DOMAINS[first:], *DOMAINS[:first]) if domain not in taken]
 
 
 class Process:
@@ -181,13 +181,16 @@ class Backend:
         settings: tuple[str, ...] | list[str] = (),
         namespace: str = "",
         seconds: float = 60,
+        **environment: str,
     ) -> None:
         self.folder, self.name = folder, f"{namespace}/slam_backend"
         words: list[object] = ["run", "--data-dir", folder]
         words += ["--config", config] if config else []
         words += ["--namespace", namespace] if namespace else []
         words += [word for setting in settings for word in ("--set", setting)]
-        self.process = processes.start("-m", "slam_backend", *words, "--", *arguments, seconds=seconds)
+        self.process = processes.start(
+            "-m", "slam_backend", *words, "--", *arguments, seconds=seconds, **environment
+        )
 
     @property
     def children(self) -> dict[int, str]:

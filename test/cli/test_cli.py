@@ -170,6 +170,25 @@ def test_an_interrupt_while_working_is_one_line() -> None:
     assert process.returncode == 130
 
 
+@pytest.mark.parametrize("module", ["slam_backend.cli", "typer", "slam_backend.cli.replay"])
+def test_an_interrupt_while_it_starts_shows_no_traceback(module: str) -> None:
+    """Ctrl-C at the moment when this module is to be imported."""
+    source = (
+        "import os, runpy, signal, sys\n"
+        "class Interrupt:\n"
+        "    def find_spec(name, path=None, target=None):\n"
+        f"        if name == '{module}': sys.meta_path.remove(Interrupt); os.kill(os.getpid(), signal.SIGINT)\n"
+        "sys.meta_path.insert(0, Interrupt); sys.argv = ['slam-backend', 'replay', '--help']\n"
+        "runpy.run_module('slam_backend', run_name='__main__')\n"
+    )
+    ran = subprocess.run(
+        [sys.executable, "-c", source], cwd=ROOT, capture_output=True, text=True, check=False
+    )
+    assert ran.returncode in (-signal.SIGINT, 130)
+    assert ran.stderr in ("", "slam-backend: interrupted\n")
+    assert ran.stdout == ""
+
+
 @pytest.mark.parametrize("arguments", [(), *((name,) for name in cli.VERBS)])
 def test_help_is_quick(arguments: tuple[str, ...]) -> None:
     """In CPU time, which a busy machine does not spoil; the best of three."""
