@@ -207,13 +207,18 @@ def asked(processes: Processes, service: str, seconds: float) -> list[tuple[int,
 
 def path_share(node: Backend, processes: Processes, sender: Sender) -> float:
     """Of one core: what the node uses more when somebody listens to its path."""
-    used = []
-    for _ in range(2):
+
+    def used() -> float:
         before = node.process.cpu_seconds
         sender.drive(200, 1, 5)
-        used.append((node.process.cpu_seconds - before) / 5)
-        processes.start(LOAD, "hear", "/slam_backend/path", PATH).wait_for("first")
-    return used[1] - used[0]
+        return (node.process.cpu_seconds - before) / 5
+
+    without = used()
+    hearing = processes.start(LOAD, "hear", "/slam_backend/path", PATH)
+    hearing.wait_for("ready")
+    share = used() - without
+    hearing.wait_for("first", 0)
+    return share
 
 
 def draws(processes: Processes) -> list[float]:

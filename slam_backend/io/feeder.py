@@ -53,7 +53,9 @@ class _Worker:
 
 
 class Feeder:
-    """told: called with every Report, in a thread of its own. died: called there with one line whenever a worker was lost."""
+    """told: called with every Report, in a thread of its own. died: called there with one line whenever a worker was lost.
+    held: the row up to which a worker is fed; None: to the end.
+    """
 
     def __init__(
         self,
@@ -62,19 +64,19 @@ class Feeder:
         table: Mapping[str, tuple[str, str]],
         told: Callable[[Report], None],
         died: Callable[[str], None],
+        held: int | None = None,
     ) -> None:
         self._journal, self._config, self._table = journal, config, table
         self._told, self._died = told, died
-        self._begin = (
-            journal.committed
-        )  # rows that lie behind: a request is not answered before they are read
+        self.held = held
+        self._begin = self._fed  # rows that lie behind: a request is not answered before they are read
         self._told_to = 0
         self._ids = count(1)
         self._requests: deque[Request] = deque()
         self._last: Request | None = None
         self._answers: dict[int, Answer | None] = {}  # None: still to come
         self._answered = threading.Condition()
-        self._stop, self._hold = threading.Event(), threading.Event()
+        self._stop = threading.Event()
         self.restarts = 0
         self._worker = _Worker(config, table, 0)
         self._thread = threading.Thread(target=self._keep, name="feeder", daemon=True)
@@ -93,9 +95,18 @@ class Feeder:
         """Rows that the worker has not read yet."""
         return max(self._journal.committed - self._worker.applied, 0)
 
+    @property
+    def _fed(self) -> int:
+        """Rows that a worker may be given."""
+        held, committed = self.held, self._journal.committed
+        return committed if held is None else min(held, committed)
+
     def pause(self, on: bool) -> None:
-        """While paused, records are journaled but not fed."""
-        self._hold.set() if on else self._hold.clear()
+        """While paused, records are journaled but not fed; a worker that dies gets a successor that is fed as far as it was."""
+        if not on:
+            self.held = None
+        elif self.held is None:
+            self.held = max(self._worker.sent, self._told_to)
 
     def request(self, name: RequestName, argument: str = "", timeout: float = 10.0) -> Any:
         """Ask the worker, between two batches of rows. SlamError when it cannot, or not in time (s)."""
@@ -128,7 +139,7 @@ class Feeder:
 
         SlamError if that was not done in time (s). A worker that dies meanwhile gets a successor.
         """
-        self._hold.clear()
+        self.held = None
         try:
             summary = self.request("finish", folder, timeout)
             self._worker.end(FAREWELL)
@@ -203,13 +214,13 @@ class Feeder:
                 if request is not None:
                     worker.asked.append(request.id)
                     worker.pipe.send(request)
-                elif not self._hold.is_set() and self._journal.committed > worker.sent:
+                elif (ready := self._fed - worker.sent) > 0:
                     left = worker.quiet_until - worker.sent
-                    rows = reader.after(worker.sent, min(BATCH, left) if left > 0 else BATCH)
+                    rows = reader.after(worker.sent, min(BATCH, ready, left if left > 0 else BATCH))
                     worker.pipe.send(rows)
                     worker.sent = rows[-1].id
                 else:
-                    after = self._journal.committed if self._hold.is_set() else worker.sent
+                    after = worker.sent if self.held is None else self._journal.committed
                     self._journal.wait(after, PATIENCE, lambda: bool(self._requests) or worker.gone)
         finally:
             reader.close()

@@ -69,7 +69,7 @@ class Diagnostics:
         if what:
             values |= {"last_incident": what, "last_incident_age_s": f"{monotonic() - when:.0f}"}
         if feeder is None or journal is None:
-            return WARN, "waiting for a source", values
+            return WARN, "paused" if self._state.paused else "waiting for a source", values
         values |= {
             "alive": str(feeder.alive).lower(),
             "queue": str(feeder.backlog),
@@ -93,15 +93,22 @@ class Diagnostics:
                 "correction_m": f"{sqrt(x * x + y * y + z * z):.3f}",
                 "correction_rad": f"{angle:.4f}",
             }
+        return *self._how(feeder, journal), values
+
+    def _how(self, feeder: Feeder, journal: Journal) -> tuple[int, str]:
+        """The worst that there is to say of the worker."""
+        when, what = self._state.incidents[-1] if self._state.incidents else (0.0, "")
         if not feeder.alive:
-            return ERROR, "the worker is dead; another is being started", values
+            return ERROR, "the worker is dead; another is being started"
         if journal.trouble:
-            return ERROR, journal.trouble, values
+            return ERROR, journal.trouble
         if what and monotonic() - when < FRESH:
-            return ERROR, what, values
+            return ERROR, what
+        if self._state.paused:
+            return WARN, f"paused; {feeder.backlog} records wait"
         if feeder.backlog > BEHIND:
-            return WARN, f"the worker is {feeder.backlog} records behind", values
-        return OK, "solving", values
+            return WARN, f"the worker is {feeder.backlog} records behind"
+        return OK, "solving"
 
 
 def _status(name: str, level: int, message: str, values: Mapping[str, str]) -> Status:

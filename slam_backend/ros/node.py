@@ -86,6 +86,7 @@ class BackendNode(SteadfastNode):
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:  # noqa: ARG002
         self._closed = threading.Event()
         self.state.clear()
+        self.state.paused = False
         self.config = self._given
         self._intake = Intake(self, self._typestore, finding=not self._given.sources)
         frames = self.config.map_frame, self.config.odom_frame, self.config.base_frame or "base_link"

@@ -6,6 +6,7 @@ the others out.
 """
 
 import json
+import shutil
 import threading
 from collections.abc import Awaitable, Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
@@ -36,6 +37,7 @@ from .believed import Believed
 from .state import State
 
 RUNS = "runs"  # the folder of saved runs, under data_dir
+ASIDE = "."  # begins the name of a run that is not whole yet
 SAVING = 120.0  # s that the worker may take to come to a request to save, and to do it
 FRESH = 0.2  # s that an answer may wait for a newer snapshot
 LOOK = 0.003  # s between two looks for it
@@ -65,6 +67,8 @@ class Services:
         self._feeder_of, self._refresh, self._reset = feeder_of, refresh, reset
         self._closed = False
         self._resetting = threading.Lock()
+        for broken in (data_dir / RUNS).glob(f"{ASIDE}*"):  # by a node that ended while it saved
+            shutil.rmtree(broken, ignore_errors=True)
         group = ReentrantCallbackGroup()
         table: dict[str, tuple[Any, Any]] = {
             "query": (GetParameters, self._query),
@@ -173,8 +177,12 @@ class Services:
         try:
             runs.mkdir(parents=True, exist_ok=True)
             run = next(run for run in _names(runs / stamp) if not run.exists() and _made(_aside(run)))
-            summary = ask("save", str(_aside(run)), SAVING)
-            _aside(run).rename(run)
+            try:
+                summary = ask("save", str(_aside(run)), SAVING)
+                _aside(run).rename(run)
+            except BaseException:
+                shutil.rmtree(_aside(run), ignore_errors=True)
+                raise
         except OSError as error:
             raise BadFile(f"{runs}: the run cannot be saved: {error}") from None
         counts = {name: summary["counts"][name] for name in ("keyframes", "landmarks", "factors")}
@@ -190,13 +198,13 @@ class Services:
         return {"session": "new"}
 
     def _pause(self, request: SetBool.Request, response: SetBool.Response) -> Any:
+        """Holds for sessions to come, too."""
+        self._state.paused = request.data
         feeder = self._feeder_of()
-        if feeder is None:
-            response.message = json.dumps({"error": "there is no session: no source has been heard yet"})
-            return response
-        feeder.pause(request.data)
+        if feeder is not None:
+            feeder.pause(request.data)
         response.success = True
-        response.message = json.dumps({"paused": request.data, "backlog": feeder.backlog})
+        response.message = json.dumps({"paused": request.data, "backlog": feeder.backlog if feeder else 0})
         return response
 
     def _edit(self, _: Any, response: SetParametersAtomically.Response) -> Any:
@@ -276,7 +284,7 @@ def _names(path: Path) -> Iterator[Path]:
 
 def _aside(run: Path) -> Path:
     """Where it is written: a run under its own name is whole."""
-    return run.with_name(f".{run.name}")
+    return run.with_name(f"{ASIDE}{run.name}")
 
 
 def _made(folder: Path) -> bool:

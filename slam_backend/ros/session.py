@@ -35,7 +35,9 @@ class Session:
         with self._lock:
             if self._ended:
                 return
+            held = 0 if self._state.paused else None
             if self.feeder is not None:
+                held = self.feeder.held
                 self.feeder.close()
             self.journal.announce(
                 {
@@ -44,7 +46,8 @@ class Session:
                 }
             )
             self._state.expect(self.journal.committed)
-            self.feeder = Feeder(self.journal, config, table, self._state.take, self._incident)
+            self.feeder = Feeder(self.journal, config, table, self._state.take, self._incident, held)
+            self.feeder.pause(self._state.paused)  # as it is by now
 
     def end(self, seconds: float) -> Any:
         """Close the journal, let the worker read it to its end and save; the run's summary, None if nothing was heard.

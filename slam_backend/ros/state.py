@@ -28,6 +28,7 @@ class State:
         self.incidents: deque[tuple[float, str]] = deque(
             maxlen=100
         )  # s on the monotonic clock, what happened
+        self.paused = False  # inputs are journaled but not applied; outlasts a session
         self._untold: list[Decision] = []
         self._unshown = False
         self._behind = 0  # rows that a new worker has yet to read before its updates are news

@@ -188,6 +188,23 @@ def test_paused_it_keeps_records_and_answers(stage, drive) -> None:
     assert stage.finish()["run_hash"] == summary["run_hash"]
 
 
+def test_paused_a_dead_worker_gets_a_successor_that_knows_as_much(stage, drive) -> None:
+    """And no more, until it goes on."""
+    _, records, summary, _ = drive
+    stage.append(records[:200])
+    stage.until(stage.has_read(200))
+    stage.feeder.pause(True)
+    stage.append(records[200:])
+    stage.until(lambda: stage.journal.committed == len(records))
+    before = len(stage.feeder.request("snapshot").stamps)
+    os.kill(stage.feeder.pid, signal.SIGKILL)
+    stage.until(lambda: stage.feeder.restarts == 1)
+    assert len(stage.feeder.request("snapshot").stamps) == before
+    assert stage.feeder.backlog == len(records) - 200
+    stage.feeder.pause(False)
+    assert stage.finish()["run_hash"] == summary["run_hash"]
+
+
 def test_after_a_death_answers_are_not_older_than_before(stage, drive) -> None:
     """A request waits until the new worker knows what the old one knew."""
     stage.append(drive[1])

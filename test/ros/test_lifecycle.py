@@ -11,6 +11,7 @@ pytest.importorskip("rclpy")
 
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState, GetState
+from std_srvs.srv import SetBool, Trigger
 
 import slam_backend as sb
 from slam_backend.core.measurement import SECOND
@@ -110,6 +111,28 @@ def test_a_folder_that_cannot_be_used_is_said_in_one_line(backend, peer, life, d
     assert life.change(Transition.TRANSITION_CONFIGURE)
     assert life.change(Transition.TRANSITION_ACTIVATE)
     assert life.change(Transition.TRANSITION_ACTIVE_SHUTDOWN)
+
+
+def test_a_pause_outlasts_sessions(backend, peer, drive) -> None:
+    """Whether the source or the pause comes first; a session that ends applies what it has kept."""
+    node = backend()
+    odometry = [record for record in drive.records if record.topic == "/odom"]
+    pose = peer.hear("/slam_backend/pose", "geometry_msgs/msg/PoseWithCovarianceStamped")
+    told = peer.hear("/diagnostics", "diagnostic_msgs/msg/DiagnosticArray")
+    assert peer.call(SetBool, "/slam_backend/pause", SetBool.Request(data=True)).success
+    peer.play(odometry[:100])
+    peer.until(lambda: node.rows() == {"/odom": 100})
+    peer.until(lambda: told and told[-1].status[-1].message == "paused; 100 records wait")
+    assert peer.call(Trigger, "/slam_backend/reset").success
+    pose.clear()
+    peer.play(odometry[100:150])
+    peer.until(lambda: node.rows() == {"/odom": 50})
+    peer.spin(0.5)
+    assert not pose
+    assert peer.call(SetBool, "/slam_backend/pause", SetBool.Request(data=False)).success
+    peer.until(lambda: pose)
+    assert node.end()["counts"]["records"] == 50
+    assert node.replayed("-1")["counts"]["records"] == 100
 
 
 @pytest.mark.slow

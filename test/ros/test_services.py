@@ -369,6 +369,30 @@ def test_two_saves_at_once_are_two_whole_runs(warehouse) -> None:
     assert [path for path in runs[0].parent.iterdir() if path.name.startswith(".")] == []
 
 
+def test_a_save_that_fails_leaves_nothing_behind(host) -> None:
+    client = host("slow")
+    client.wait_for(1_700_000_001 * 10**9)
+    os.kill(client.worker, signal.SIGSTOP)
+    saving, runs = client.begin("save", Trigger.Request(), Trigger), client.folder / "runs"
+    until = time.monotonic() + 10
+    while not (runs.exists() and list(runs.iterdir())):
+        assert time.monotonic() < until, "it has not begun to save"
+        time.sleep(0.02)
+    os.kill(client.worker, signal.SIGKILL)
+    saved, content = told(client.end(saving))
+    assert not saved
+    assert "the worker ended" in content["error"]
+    assert list(runs.iterdir()) == []
+
+
+def test_what_a_killed_node_had_not_saved_whole_is_removed_by_the_next(host, tmp_path) -> None:
+    for name in (".2026-01-01T00-00-00Z", "2026-01-01T00-00-00Z"):
+        (tmp_path / "runs" / name).mkdir(parents=True)
+        (tmp_path / "runs" / name / "trajectory.tum").touch()
+    host("nothing")
+    assert [path.name for path in (tmp_path / "runs").iterdir()] == ["2026-01-01T00-00-00Z"]
+
+
 def test_nothing_is_saved_before_there_is_something(host) -> None:
     client = host("nothing")
     saved, content = client.trigger("save")
