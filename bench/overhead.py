@@ -84,12 +84,12 @@ def bare(path: Path, qr: bool) -> tuple[float, float]:
         batches.setdefault(max(keys), []).append((min(keys), graph.at(i)))
     batches = {key: [f for _, f in sorted(batches[key], key=lambda e: -e[0])] for key in sorted(batches)}
     begin = process_time()
-    isam = _bare_loop(batches, spatial, qr)
+    isam = bare_loop(batches, spatial, qr)
     seconds = process_time() - begin
     return seconds, graph.error(isam.calculateBestEstimate())
 
 
-def _bare_loop(batches: dict[int, list[Any]], spatial: bool, qr: bool) -> gtsam.ISAM2:
+def bare_loop(batches: dict[int, list[Any]], spatial: bool, qr: bool) -> gtsam.ISAM2:
     defaults = Config().isam2
     params, descent, force = gtsam.ISAM2Params(), gtsam.ISAM2GaussNewtonParams(), gtsam.ISAM2UpdateParams()
     params.setRelinearizeThreshold(defaults.relinearize_threshold)
