@@ -22,7 +22,7 @@ setup(
     maintainer_email="maintainers@slam-backend.invalid",
     python_requires=">=3.11",
     packages=find_packages(include=[NAME, f"{NAME}.*"]),
-    package_data={NAME: ["py.typed"]},
+    package_data={NAME: ["py.typed", "lab/report/page.html"]},
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),
         (f"share/{NAME}", ["package.xml"]),
@@ -37,6 +37,7 @@ setup(
         "matplotlib",
         "mcap>=1.2",  # brings lz4 and zstandard
         "numpy>=1.26",
+        "plotly>=6",
         "pydantic>=2",
         "pymap3d",
         "PyYAML",

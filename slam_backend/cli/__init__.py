@@ -28,6 +28,7 @@ VERBS: Mapping[
     "dataset": "A public data set that ships with gtsam, as a bag.",
     "simulate": "A world with ground truth, as a bag.",
     "convert": "A pose graph or trajectory from one format to another.",
+    "report": "A page that answers what people ask of a run.",
     "query": "Poses at any stamp, covariances, landmarks, decisions of a finished run.",
 }
 

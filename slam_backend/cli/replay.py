@@ -11,6 +11,7 @@ from ..core.errors import BadConfig
 from .progress import progress
 
 if TYPE_CHECKING:
+    from ..io.history import History
     from ..io.replay import Run
 
 
@@ -36,15 +37,20 @@ def command(
         Literal["isam2", "ekf"],
         typer.Option(help="isam2: the smoother; ekf: a filter over the same factors, to compare with."),
     ] = "isam2",
+    report: Annotated[
+        bool, typer.Option(help="Write report.html, the page that answers what people ask.")
+    ] = True,
     out: Annotated[Path | None, typer.Option(metavar="DIR", help="Default: runs/NAME of the input.")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print the summary as JSON.")] = False,
 ) -> None:
     """Replay recorded logs through the same core as the live node, and write a run directory."""
     from ..io.configfile import load_config
+    from ..io.history import NAME, History
     from ..io.replay import replay
-    from ..io.rundir import PICTURE, prepare, write_run
+    from ..io.rundir import FinishedRun, prepare, write_run
     from ..lab.ekf import ESTIMATORS
-    from ..lab.picture import draw
+    from ..lab.picture import PICTURE, draw
+    from ..lab.report import REPORT, write_report
 
     if final == "batch" and estimator != "isam2":
         raise BadConfig("--final batch: a filter has no batch solution; leave it out, or --estimator")
@@ -53,19 +59,24 @@ def command(
     run = replay(
         inputs, load_config(config) if config else None, settings or (), final, ESTIMATORS[estimator]
     )
-    _watch(run)
+    history = History(run)
+    _watch(run, history)
     write_run(run.result, target)
+    history.write(target / NAME)
     draw(run.result, target / PICTURE)
+    if report:
+        write_report(FinishedRun(target), target / REPORT)
     if as_json:
         typer.echo(json.dumps(run.result.summary))
     else:
         _report(run, target)
 
 
-def _watch(run: "Run") -> None:
+def _watch(run: "Run", history: "History") -> None:
     with progress("replay", run.inputs.count) as advance:
         shown = 0
-        for _ in run:
+        for update in run:
+            history.see(update)
             advance(run.inputs.read - shown)
             shown = run.inputs.read
         advance(run.inputs.count - shown)

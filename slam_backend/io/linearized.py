@@ -4,6 +4,7 @@ graph.g2o cannot say all that they rest on: it has no line for gauges, absolute 
 every factor is its whitened Jacobian and its whitened residual, robust weight included, in a few flat arrays (linearized.npz):
 
     indices   (N,) of the keyframes, in order of stamp, as in trajectory.tum
+    landmarks (L,) their variables, as in landmarks.csv
     ids       (F,) of the factors                kinds    (F,) motion, loop, landmark, pose, gauge
     counts    (F,) variables of each factor      rows     (F,) rows of its Jacobian
     keys      (M,) those variables, all factors  columns  (M,) their dimensions
@@ -12,7 +13,7 @@ every factor is its whitened Jacobian and its whitened residual, robust weight i
 """
 
 import zlib
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -28,12 +29,18 @@ from ..core.measurement import Array
 from ..core.trajectory import Stamps
 
 ARRAYS = {"indices": "i", "counts": "i", "rows": "i", "keys": "u", "columns": "i", "numbers": "f",
-          "errors": "f", "ids": "U", "kinds": "U"}  # fmt: skip
+          "errors": "f", "ids": "U", "kinds": "U", "landmarks": "u"}  # fmt: skip
 Strings = NDArray[np.str_]
 ADDABLE = 3  # variables of a factor that gtsam can make from matrices directly
 
 
-def write_linearized(path: Path, factors: Iterable[Factor], values: gtsam.Values, indices: Stamps) -> None:
+def write_linearized(
+    path: Path,
+    factors: Iterable[Factor],
+    values: gtsam.Values,
+    indices: Stamps,
+    landmarks: Sequence[int] = (),
+) -> None:
     """factors: at `values`; inactive ones are left out."""
     sizes = values.zeroVectors()
     active = [(f, each) for f in factors if (each := f.factor.linearize(values)) is not None]
@@ -43,6 +50,7 @@ def write_linearized(path: Path, factors: Iterable[Factor], values: gtsam.Values
     np.savez_compressed(
         path,
         indices=indices,
+        landmarks=np.array(landmarks, dtype=np.uint64),
         counts=np.array([len(each) for each in keys], dtype=np.int64),
         rows=np.array([len(errors) for _, errors in systems], dtype=np.int64),
         keys=np.array(flat, dtype=np.uint64),
@@ -89,6 +97,11 @@ class Linearized:
         return [each.tolist() for each in np.split(self._arrays["keys"], ends[:-1])] if len(ends) else []
 
     @property
+    def landmarks(self) -> list[int]:
+        """The variables of the landmarks, in the order of landmarks.csv."""
+        return list(self._arrays["landmarks"].tolist())
+
+    @property
     def rows(self) -> Stamps:
         """(F,) degrees of freedom that each factor measures."""
         return np.asarray(self._arrays["rows"])
@@ -111,19 +124,41 @@ class Linearized:
             raise SolverFailure(f"keyframe {index}: the factors do not determine its pose", ())
         return found
 
+    def redundancy(self, draws: int = 4) -> Array:
+        """(F,) degrees of freedom of each factor that the others check: what its chi-square is on average, if every noise is stated truly.
+
+        The diagonal of I - A (A^T A)^-1 A^T: each draw fits white noise and looks at what is left. A sum over many factors has a relative
+        error of about sqrt(2 / draws / sum).
+        """
+        random, ends = np.random.default_rng(0), np.cumsum(self.rows)
+        left = np.zeros(len(ends))
+        for _ in range(draws):
+            noise = random.standard_normal(int(self.rows.sum()))
+            graph = self._graph(noise)
+            fit = graph.optimize()
+            errors = np.concatenate([graph.at(n).error_vector(fit) for n in range(graph.size())])
+            remains = np.concatenate([[0.0], np.cumsum(errors**2)])
+            left += (remains[ends] - remains[ends - self.rows]) / draws
+        return left
+
     @cached_property
     def _tree(self) -> Any:  # a GaussianBayesTree
         """By QR, which long open trajectories do not break."""
+        return self._graph(np.zeros(int(self.rows.sum()))).eliminateMultifrontal(function=gtsam.EliminateQR)
+
+    def _graph(self, right: Array) -> Any:  # a GaussianFactorGraph
+        """right: all right-hand sides, one after the other."""
         graph: Any = gtsam.GaussianFactorGraph()
+        at = 0
         for terms, rows in self._factors():
+            side = right[at : at + rows]
+            at += rows
             if len(terms) <= ADDABLE:
-                graph.add(*(part for term in terms for part in term), np.zeros(rows))
+                graph.add(*(part for term in terms for part in term), side)
             else:  # a conditional is a factor too, and takes any number of variables
                 unit = gtsam.noiseModel.Unit.Create(rows)
-                graph.push_back(
-                    gtsam.JacobianFactor(gtsam.GaussianConditional(terms, 1, np.zeros(rows), unit))
-                )
-        return graph.eliminateMultifrontal(function=gtsam.EliminateQR)
+                graph.push_back(gtsam.JacobianFactor(gtsam.GaussianConditional(terms, 1, side, unit)))
+        return graph
 
     def _factors(self) -> Iterator[tuple[list[tuple[int, Array]], int]]:
         """(variable, its block) of each factor, and the number of rows."""
@@ -141,7 +176,7 @@ class Linearized:
 
     def _fits(self) -> None:
         counts, rows, keys, columns, numbers, errors, ids, kinds = (
-            self._arrays[name] for name in list(ARRAYS)[1:]
+            self._arrays[name] for name in list(ARRAYS)[1:9]
         )
         whole = len({len(each) for each in (counts, rows, ids, kinds)}) == 1
         whole = whole and counts.sum() == len(keys) == len(columns) and rows.sum() == len(errors)

@@ -168,6 +168,11 @@ class Seconds:
         if updates:
             self._updates.append(seconds)
 
+    @property
+    def last_ms(self) -> float:
+        """Of the newest update."""
+        return self._updates[-1] * 1e3 if self._updates else 0.0
+
     def recent(self) -> tuple[float, float]:
         """Median and 99th percentile, in ms, of the last updates."""
         ms = np.array(self._updates[-RECENT:] or [0.0]) * 1e3

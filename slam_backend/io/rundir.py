@@ -24,6 +24,8 @@ from .export import pose_graph
 from .formats import trajectory as forms
 from .formats import tum, write_graph, write_trajectory
 from .formats.lines import read_bytes, read_text
+from .history import NAME as HISTORY
+from .history import Recorded
 from .linearized import Linearized, write_linearized
 from .replay import Result
 
@@ -31,7 +33,7 @@ FILES = ("summary.json", "config.yaml", "trajectory.tum", "odometry.tum", "onlin
          "decisions.jsonl", "graph.g2o", "linearized.npz")  # fmt: skip
 
 
-PICTURE = "trajectory.png"  # drawn by the command line
+DRAWN = ("trajectory.png", "report.html", HISTORY)  # by the command line
 
 
 def write_run(result: Result, out: Path | str) -> None:
@@ -39,7 +41,7 @@ def write_run(result: Result, out: Path | str) -> None:
     out = Path(out)
     prepare(out)
     out.mkdir(parents=True, exist_ok=True)
-    for stale in ("summary.json", PICTURE):  # the summary comes last, and says that the run is whole
+    for stale in ("summary.json", *DRAWN):  # the summary comes last, and says that the run is whole
         (out / stale).unlink(missing_ok=True)
     snapshot = result.snapshot
     for name, trajectory in (
@@ -51,7 +53,8 @@ def write_run(result: Result, out: Path | str) -> None:
     _write_landmarks(out / "landmarks.csv", result)
     _write_decisions(out / "decisions.jsonl", result)
     write_graph(out / "graph.g2o", pose_graph(result))
-    write_linearized(out / "linearized.npz", result.factors, result.values, snapshot.indices)
+    landmarks = [result.run.backend.landmark(name) for name in snapshot.names]
+    write_linearized(out / "linearized.npz", result.factors, result.values, snapshot.indices, landmarks)
     write_yaml(out / "config.yaml", result.run.config)
     summary = json.dumps(result.summary, indent=1)
     (out / "summary.json").write_text(summary + "\n", encoding="utf-8")
@@ -72,7 +75,7 @@ def prepare(out: Path) -> None:
 
 def _is_run(out: Path) -> bool:
     """Whether a directory holds nothing but a run, whole or broken off."""
-    if any(path.name not in (*FILES, PICTURE) for path in out.iterdir()):
+    if any(path.name not in (*FILES, *DRAWN) for path in out.iterdir()):
         return False
     try:
         return "run_hash" in json.loads((out / "summary.json").read_text(encoding="utf-8"))
@@ -124,6 +127,9 @@ def _covariance(result: Result, key: int, space: Space) -> Iterable[float]:
     except SlamError:
         full[:] = np.nan  # not determined: said, rather than a zero that looks certain
     return [float(value) for value in full[np.triu_indices(3)]]
+
+
+TRIANGLE = np.array([[3, 4, 5], [4, 6, 7], [5, 7, 8]])  # columns of a landmark's numbers as a covariance
 
 
 class FinishedRun:
@@ -185,6 +191,28 @@ class FinishedRun:
         return found
 
     @cached_property
+    def online(self) -> Trajectory:
+        """What was believed of each keyframe when it was newest."""
+        return self._trajectory("online.tum")
+
+    @cached_property
+    def history(self) -> Recorded | None:
+        """None where nobody watched the run."""
+        return Recorded(self.path / HISTORY) if (self.path / HISTORY).exists() else None
+
+    @cached_property
+    def decisions(self) -> list[Mapping[str, Any]]:
+        """The lines of decisions.jsonl."""
+        path = self.path / "decisions.jsonl"
+        lines = read_bytes(path).split(b"\n")
+        if lines[-1]:
+            raise BadFile(f"{path}:{len(lines)}: is damaged: the line does not end")
+        try:
+            return [json.loads(line) for line in lines[:-1]]
+        except ValueError:
+            raise BadFile(f"{path}: is damaged: a line is no JSON") from None
+
+    @cached_property
     def linearized(self) -> Linearized:
         found = Linearized(self.path / "linearized.npz")
         self._counted("linearized.npz", len(found.indices), self._keyframes)
@@ -194,14 +222,24 @@ class FinishedRun:
     def indices(self) -> Stamps:
         return self.linearized.indices
 
-    @cached_property
+    @property
     def landmarks(self) -> Mapping[str, Array]:
         """Positions (3,) in the map, by name."""
+        return {name: numbers[:3] for name, numbers in self._landmark_rows.items()}
+
+    @property
+    def landmark_covariances(self) -> list[Array]:
+        """(3, 3) of each position; NaN where it is not determined."""
+        return [numbers[TRIANGLE] for numbers in self._landmark_rows.values()]
+
+    @cached_property
+    def _landmark_rows(self) -> Mapping[str, Array]:
+        """Position and upper triangle of its covariance, (9,), by name."""
         path = self.path / "landmarks.csv"
         reader = csv.reader(StringIO(read_text(path), newline=""))
         try:
             next(reader)
-            found = {row[0]: np.array(row[2:5], dtype=np.float64).reshape(3) for row in reader}
+            found = {row[0]: np.array(row[2:11], dtype=np.float64).reshape(9) for row in reader}
         except (csv.Error, ValueError, IndexError):
             raise BadFile(f"{path}:{reader.line_num}: is damaged: no name and position") from None
         self._counted(path.name, len(found), self._landmarks)

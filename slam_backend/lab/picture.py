@@ -11,10 +11,11 @@ from ..core.graph import Decision
 from ..core.measurement import Array
 from ..core.trajectory import Trajectory
 from ..io.replay import Result
+from .colours import LANDMARK, LOOP, ODOMETRY, REFUSED, SMOOTHED
 
+PICTURE = "trajectory.png"
 mpl.use("Agg")  # no screen is needed
 
-ODOMETRY, SMOOTHED, LOOP, REFUSED, LANDMARK = "#d9822b", "#1f4e9c", "#3c9a5f", "#c0392b", "#555555"
 LAID_FLAT = 0.02  # share of the largest extent below which height is not worth a view of its own
 
 

@@ -1,0 +1,44 @@
+"""report.html: one page, with everything in it, that answers what a person asks of a run.
+
+Each section is a file with a function `section(run)`; one that has no data gives None, and is absent.
+"""
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+from ...io.rundir import FinishedRun
+from . import (
+    convergence,
+    drift,
+    health,
+    loops,
+    neighbours,
+    playback,
+    residuals,
+    sparsity,
+    summary,
+    timing,
+    trajectory,
+)
+from .page import Section, html
+
+REPORT = "report.html"
+SECTIONS: Sequence[Callable[[FinishedRun], Section | None]] = (
+    summary.section,
+    trajectory.section,
+    playback.section,
+    loops.section,
+    drift.section,
+    residuals.section,
+    neighbours.section,
+    convergence.section,
+    sparsity.section,
+    timing.section,
+    health.section,
+)
+
+
+def write_report(run: FinishedRun, out: Path) -> None:
+    """Write the page. BadFile if a file of the run is missing or damaged."""
+    sections = [section for make in SECTIONS if (section := make(run)) is not None]
+    out.write_text(html(summary.title(run), sections), encoding="utf-8")
