@@ -1,5 +1,6 @@
 """The back-end: measurements in, small updates out, snapshots when asked. No clock, no file, no thread, no ROS."""
 
+import json
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -10,8 +11,10 @@ import numpy as np
 
 from .adopted import Adopted
 from .apply import Applier, touched, without
+from .command import Command
 from .config import Config, LandmarkSource, OdometrySource, PoseSource, RelativeSource
 from .context import Context
+from .editor import Editor, Shift
 from .errors import BadConfig, SlamError, SolverFailure
 from .graph import (
     Decision,
@@ -20,6 +23,7 @@ from .graph import (
     Keyframe,
     Offer,
     Pose,
+    Verdict,
     landmark_key,
     total,
 )
@@ -44,7 +48,6 @@ SOURCES = {  # of a configuration that names none: one of each kind, by the name
     "landmark": LandmarkSource(),
     "pose": PoseSource(),
 }
-NOTICEABLE = (1e-3, 1e-4)  # m, rad: a correction of the newest pose that counts as a revision
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -99,6 +102,7 @@ class Backend:
         self._newest: tuple[Keyframe, Pose] | None = None  # and its odometry pose
         book = paths.book if self._robust else lambda _: None
         self._applier = Applier(self.solver, space, self.parts, self._waiting.wake, book)
+        self._editor = Editor(self.solver, space, self._applier)
         self._revision = 0
 
     def add(self, measurement: Measurement) -> list[Update]:
@@ -106,6 +110,8 @@ class Backend:
         if isinstance(measurement, StaticTransform):
             self._mounts.add(measurement)
             return []
+        if isinstance(measurement, Command):
+            return self._carry_out(measurement)
         if isinstance(measurement, OdometryPose) and measurement.source == self._driver:
             return self._drive(measurement)
         updates = []
@@ -272,6 +278,24 @@ class Backend:
         """The key of a landmark by its name; a new name gets a new key."""
         return self._landmarks.setdefault(name, landmark_key(len(self._landmarks)))
 
+    def _carry_out(self, command: Command) -> list[Update]:
+        """What a person asks; what came of it is a decision, told with the newest keyframe."""
+        verdict: Verdict = "accepted"
+        try:
+            outcome = self._editor.carry_out(command)
+            self._revision += outcome.revised
+            detail = json.dumps({**outcome.told, "revision": self._revision})
+        except SlamError as error:
+            verdict, detail = "refused", str(error)
+        newest = self._newest[0] if self._newest else None
+        stamp = newest.stamp if newest else 0
+        self._decisions.append(
+            Decision(
+                stamp, f"command/{command.id}", command.source, verdict, "command", command.action, detail
+            )
+        )
+        return [self._told(newest)] if newest else []
+
     # -- the way of a change ---------------------------------------------------------------------
 
     def _update(
@@ -339,8 +363,7 @@ class Backend:
         """The update for the newest keyframe, with the decisions since the last one."""
         pose = self.estimate.pose(b.pose)
         if guess is not None:
-            meters, radians = self.space.size(guess.between(pose))
-            self._revision += meters > NOTICEABLE[0] or radians > NOTICEABLE[1]
+            self._revision += Shift(*self.space.size(guess.between(pose))).noticeable
         correction = pose.compose(self.track.pose(b.stamp).inverse())
         decisions = (*self._decisions, *self._applier.take_decisions())
         self._decisions = []

@@ -11,6 +11,7 @@ from collections import Counter
 from collections.abc import Iterable, Iterator
 from heapq import heappop, heappush
 
+from .command import Command
 from .graph import Decision
 from .measurement import SECOND, Measurement, StaticTransform, format_stamp
 
@@ -20,7 +21,7 @@ FAR = 1 << 62
 def settled(
     items: Iterable[Measurement | Decision], driver: str, lag: int, last_resort: bool = True
 ) -> Iterator[Measurement | Decision]:
-    """Reorder measurements; decisions pass through at once.
+    """Reorder measurements; decisions, and what has no moment of its own, pass through at once.
 
     driver: the source whose stamps move the watermark. lag: ns. last_resort: release what waits when the input ends.
     """
@@ -28,7 +29,7 @@ def settled(
     count: Counter[str] = Counter()
     watermark = -FAR
     for item in items:
-        if isinstance(item, Decision | StaticTransform):
+        if isinstance(item, Decision | StaticTransform | Command):
             yield item
             continue
         drives = item.source == driver

@@ -14,6 +14,7 @@ import numpy as np
 from rosbags.serde import SerdeError
 from rosbags.typesys.store import Typestore
 
+from ..core import command
 from ..core.errors import BadMessage
 from ..core.graph import Decision
 from ..core.measurement import SECOND, Array, Measurement, parse_frame
@@ -37,6 +38,12 @@ _NONSENSE = (
     BadMessage, SerdeError, struct.error, ValueError, TypeError, LookupError, AttributeError, ArithmeticError,
     AssertionError, MemoryError, RecursionError,
 )  # fmt: skip
+
+
+DECODERS: Mapping[str, Mapping[str, SensorDecoder]] = {  # kind of a source -> type -> the long way
+    **{kind: sensor.decoders for kind, sensor in SENSORS.items()},
+    "command": command.DECODERS,
+}
 
 
 class _Names(dict[bytes, tuple[str, ...]]):
@@ -146,7 +153,7 @@ class Decoder:
 
     def _route(self, record: Record) -> _Route:
         source, kind = self._table[record.topic]
-        slow = SENSORS[kind].decoders.get(record.type) if kind in SENSORS else None
+        slow = DECODERS.get(kind, {}).get(record.type)
         fast, count = _FAST.get((kind, record.type), (None, 0))
         route = _Route(record.type, source, fast, _Names(count), slow)
         self._routes[record.topic] = route

@@ -78,6 +78,13 @@ class _Bytes:
         return b"".join([_ENCAPSULATION, *self._pieces])
 
 
+def encode_string(text: str) -> bytes:
+    """std_msgs/msg/String."""
+    message = _Bytes()
+    message.text(text)
+    return message.finish()
+
+
 def encode_odometry(
     stamp: int,
     frame: str,

@@ -7,18 +7,23 @@ from heapq import merge
 from pathlib import Path
 from typing import Protocol, Self
 
+from ..core import command
 from ..core.config import Config
 from ..core.errors import BadConfig, BadFile
 from ..core.graph import Decision
 from ..core.measurement import Measurement
 from ..core.sensors import SENSORS
 from .bags import Bag, Topic, open_bag
-from .cdr import Decoder
+from .cdr import DECODERS, Decoder
 from .formats import FORMATS, read_graph
 from .formats.posegraph import PERIOD, PoseGraph, measurements
 
 EDGES, LANDMARKS = "edges", "landmarks"  # the sources of a graph file, when the configuration names none
 TF_STATIC = "/tf_static"
+OWN: Mapping[str, tuple[str, str]] = {  # topic -> (source, kind) of what is read without being configured
+    TF_STATIC: (TF_STATIC, "static"),
+    command.TOPIC: ("command", "command"),
+}
 
 Stream = Iterator[Measurement | Decision]
 
@@ -124,9 +129,8 @@ class BagInputs(_Closing):
                     f"source '{name}': topic '{source.topic}' belongs to source '{table[source.topic][0]}' already"
                 )
             table[source.topic] = (name, kind)
-        if TF_STATIC in topics and topics[TF_STATIC].type in SENSORS["static"].decoders:
-            table[TF_STATIC] = (TF_STATIC, "static")
-        return table
+        own = {topic: row for topic, row in OWN.items() if topic in topics}
+        return table | {topic: row for topic, row in own.items() if topics[topic].type in DECODERS[row[1]]}
 
 
 class GraphInput(_Closing):

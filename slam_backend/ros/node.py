@@ -96,7 +96,13 @@ class BackendNode(SteadfastNode):
         self.session = self._opened()
         with undisturbed():  # the services start a process
             self._answering = Services(
-                self, self.state, self._feeder, self._refresh.set, self.data_dir, self.config, self.reset
+                self,
+                self.state,
+                lambda: self.session,
+                self._refresh.set,
+                self.data_dir,
+                self.config,
+                self.reset,
             )
         threading.Thread(target=self._snapshots, args=(self._closed,), name="snapshots", daemon=True).start()
         return TransitionCallbackReturn.SUCCESS

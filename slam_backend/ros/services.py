@@ -34,11 +34,13 @@ from ..core.trajectory import Snapshot
 from ..io.feeder import Feeder
 from .answers import Answers
 from .believed import Believed
+from .session import Session
 from .state import State
 
 RUNS = "runs"  # the folder of saved runs, under data_dir
 ASIDE = "."  # begins the name of a run that is not whole yet
 SAVING = 120.0  # s that the worker may take to come to a request to save, and to do it
+ACTING = 120.0  # s that it may take to come to a command, and to carry it out
 FRESH = 0.2  # s that an answer may wait for a newer snapshot
 LOOK = 0.003  # s between two looks for it
 REVISION = "revision"  # as a name in a query: of the snapshot that answered
@@ -46,10 +48,11 @@ T = TypeVar("T")
 Value = Array | Mapping[str, Any] | int | None
 Content = Mapping[str, Any]
 NOT_YET = "not available yet"
+NO_SESSION = "there is no session: no source has been heard yet"
 
 
 class Services:
-    """feeder_of: the present feeder, None without a session. refresh: asks for a newer snapshot without waiting for it.
+    """session_of: the present session, None without one. refresh: asks for a newer snapshot without waiting for it.
     reset: begins a new session; called in a thread of its own.
     """
 
@@ -57,14 +60,14 @@ class Services:
         self,
         node: Node,
         state: State,
-        feeder_of: Callable[[], Feeder | None],
+        session_of: Callable[[], Session | None],
         refresh: Callable[[], None],
         data_dir: Path,
         config: Config,
         reset: Callable[[], None],
     ) -> None:
         self._node, self._state, self._data_dir, self._config = node, state, data_dir, config
-        self._feeder_of, self._refresh, self._reset = feeder_of, refresh, reset
+        self._session_of, self._refresh, self._reset = session_of, refresh, reset
         self._closed = False
         self._resetting = threading.Lock()
         for broken in (data_dir / RUNS).glob(f"{ASIDE}*"):  # by a node that ended while it saved
@@ -77,8 +80,9 @@ class Services:
             "load": (LoadMap, self._load),
             "pause": (SetBool, self._pause),
             "save": (Trigger, _told(self._save)),
+            "optimize": (Trigger, _told(self._optimize)),
             "reset": (Trigger, _told(self._begin_anew)),
-        } | {name: (Trigger, _told(_not_yet)) for name in ("optimize", "undo", "redo")}
+        } | {name: (Trigger, _told(_not_yet)) for name in ("undo", "redo")}
         self._services = [
             node.create_service(type_, f"~/{name}", self._survived(callback), callback_group=group)
             for name, (type_, callback) in table.items()
@@ -95,6 +99,10 @@ class Services:
             self._node.destroy_service(service)
         self._services = []
         self._answers.close()
+
+    def _feeder_of(self) -> Feeder | None:
+        session = self._session_of()
+        return session.feeder if session is not None else None
 
     def newest(self) -> Snapshot | None:
         """The newest snapshot; when keyframes have been added since, one with them if it comes within FRESH s. Waits."""
@@ -187,6 +195,20 @@ class Services:
             raise BadFile(f"{runs}: the run cannot be saved: {error}") from None
         counts = {name: summary["counts"][name] for name in ("keyframes", "landmarks", "factors")}
         return {"run": str(run), "run_hash": summary["run_hash"], **counts}
+
+    async def _optimize(self) -> Content:
+        return await self._command("optimize", {})
+
+    async def _command(self, action: str, arguments: Mapping[str, Any]) -> Content:
+        """What came of a command that went by way of the journal. SlamError says why it was not carried out."""
+        session = self._session_of()
+        if session is None:
+            raise SlamError(NO_SESSION)
+        decision = await self._elsewhere(lambda: session.command(action, arguments, ACTING))
+        if decision.verdict != "accepted":
+            raise SlamError(decision.detail)
+        content: Content = json.loads(decision.detail)
+        return content
 
     async def _begin_anew(self) -> Content:
         if not self._resetting.acquire(blocking=False):

@@ -1,15 +1,19 @@
 """One journal, and the worker that reads it."""
 
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
+from uuid import uuid4
 
+from ..core.command import TOPIC, TYPE, command, text_of
 from ..core.config import Config
-from ..core.errors import BadFile
+from ..core.errors import BadFile, SlamError
+from ..core.graph import Decision
 from ..core.sensors import SENSORS
+from ..io.encode import encode_string
 from ..io.feeder import Feeder
-from ..io.inputs import TF_STATIC
+from ..io.inputs import OWN
 from ..io.journal import NAME as JOURNAL
 from ..io.journal import Journal
 from .state import State
@@ -30,8 +34,7 @@ class Session:
 
     def work(self, config: Config) -> None:
         """A worker for these sources; one that runs already is replaced, and the new one reads the journal from its start."""
-        table: dict[str, tuple[str, str]] = {TF_STATIC: (TF_STATIC, "static")}
-        table |= {source.topic: (name, source.kind) for name, source in config.sources.items()}
+        table = dict(OWN) | {source.topic: (name, source.kind) for name, source in config.sources.items()}
         with self._lock:
             if self._ended:
                 return
@@ -48,6 +51,41 @@ class Session:
             self._state.expect(self.journal.committed)
             self.feeder = Feeder(self.journal, config, table, self._state.take, self._incident, held)
             self.feeder.pause(self._state.paused)  # as it is by now
+
+    def command(self, action: str, arguments: Mapping[str, Any], seconds: float) -> Decision:
+        """Journal what a person asks, and wait for what came of it. Any thread but the executor's.
+
+        SlamError where it cannot be carried out, or not in time (s): then it still will be.
+        """
+        if self._state.update is None or self.feeder is None:
+            raise SlamError(
+                f"there is nothing to {action} yet: no message of the driving source has been accepted"
+            )
+        if self._state.paused:
+            raise SlamError("the inputs are paused, and a command waits behind them: resume first")
+        if self.journal.trouble:
+            raise SlamError(self.journal.trouble)
+        asked = command(uuid4().hex, action, arguments)
+        if not self.journal.append(TOPIC, TYPE, encode_string(text_of(asked))):
+            raise SlamError("the session is ending")
+        name = f"command/{asked.id}"
+        decision = self._state.decision(name, seconds, unless=lambda: self._ended)
+        if decision is None:
+            raise SlamError(
+                f"not carried out {self._why_not(seconds)}; it is in the journal: ask for decision/{name}"
+            )
+        return decision
+
+    def _why_not(self, seconds: float) -> str:
+        feeder = self.feeder
+        if self._ended or feeder is None:
+            return "before the session ended"
+        late = f"within {seconds:g} s"
+        if self.journal.trouble:
+            return f"{late}: {self.journal.trouble}"
+        if self._state.paused:
+            return f"{late}: the inputs have been paused"
+        return f"{late}: the worker is {'busy' if feeder.alive else 'down'}, {feeder.backlog} records behind"
 
     def end(self, seconds: float) -> Any:
         """Close the journal, let the worker read it to its end and save; the run's summary, None if nothing was heard.

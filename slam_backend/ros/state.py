@@ -10,6 +10,7 @@ from ..core.graph import Decision
 from ..core.trajectory import Snapshot
 from ..io.worker import Report
 
+LOOK = 0.1  # s between two looks at whether to go on waiting
 DECISIONS = 10_000  # the newest that can be asked for by id
 
 
@@ -18,7 +19,7 @@ class State:
 
     def __init__(self, changed: Callable[[], None]) -> None:
         self._changed = changed
-        self._lock = threading.Lock()
+        self._lock = threading.Condition()  # notified of each report
         self.report: Report | None = None
         self.update: Update | None = None
         self.covariance: tuple[float, ...] | None = None  # 36, ROS order, of the newest keyframe
@@ -40,7 +41,16 @@ class State:
                 self.update, self.covariance = report.updates[-1], report.covariance
             for decision in report.decisions:
                 self._decide(decision)
+            self._lock.notify_all()
         self._changed()
+
+    def decision(self, id_: str, seconds: float, unless: Callable[[], bool]) -> Decision | None:
+        """Wait for the decision with that id; None if it did not come in time (s), or something else is true."""
+        until = monotonic() + seconds
+        with self._lock:
+            while (found := self.decided.get(id_)) is None and monotonic() < until and not unless():
+                self._lock.wait(min(LOOK, max(until - monotonic(), 0.0)))
+        return found
 
     def expect(self, rows: int) -> None:
         """A worker begins anew, with other sources: what was decided will be decided again; the newest pose holds until

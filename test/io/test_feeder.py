@@ -11,11 +11,14 @@ from pathlib import Path
 
 import pytest
 
+from slam_backend.core.command import TOPIC, TYPE, command, text_of
 from slam_backend.core.errors import SlamError
 from slam_backend.core.trajectory import Snapshot
 from slam_backend.io.bags import open_bag
 from slam_backend.io.configfile import load_config
+from slam_backend.io.encode import encode_string
 from slam_backend.io.feeder import Feeder
+from slam_backend.io.inputs import OWN
 from slam_backend.io.journal import Journal
 from slam_backend.io.replay import replay
 from slam_backend.lab.simulate import Options, simulate, write_simulation
@@ -45,7 +48,7 @@ class Stage:
         self.folder, self.config = folder, config
         self.reports, self.deaths = [], []
         self.journal = Journal(folder, self.deaths.append)
-        table = {source.topic: (name, source.kind) for name, source in config.sources.items()}
+        table = dict(OWN) | {source.topic: (name, source.kind) for name, source in config.sources.items()}
         self.feeder = Feeder(self.journal, config, table, self.reports.append, self.deaths.append)
 
     def append(self, records):
@@ -124,6 +127,24 @@ def test_a_killed_worker_is_replaced_and_nothing_is_told_twice(stage, drive) -> 
     assert stage.updates == updates
     assert sum(d.count for d in stage.decisions) >= sum(summary["decisions"].values())
     assert [line.split("(")[1].split(")")[0] for line in stage.deaths] == ["it ended with code -9"] * 3
+
+
+def test_a_command_is_part_of_what_a_new_worker_reads(stage, drive) -> None:
+    """Carried out in the midst of the drive, and again by the successor of a killed worker: one hash, that of the replay."""
+    _, records, summary, _ = drive
+    half = len(records) // 2
+    stage.append(records[:half])
+    stage.journal.append(TOPIC, TYPE, encode_string(text_of(command("17", "optimize", {}))))
+    stage.until(lambda: any(decision.id == "command/17" for decision in stage.decisions))
+    stage.append(records[half:-50])
+    stage.until(stage.has_read(len(records) - 49))
+    os.kill(stage.feeder.pid, signal.SIGKILL)
+    stage.append(records[-50:])
+    told = stage.finish()
+    assert told["run_hash"] == replay(stage.journal.path, stage.config).result.summary["run_hash"]
+    assert told["run_hash"] != summary["run_hash"]
+    assert told["decisions"]["command/optimize"] == 1
+    assert [decision.id for decision in stage.decisions].count("command/17") == 1
 
 
 def test_a_stopped_worker_holds_nobody_up(stage, drive) -> None:

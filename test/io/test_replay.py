@@ -9,12 +9,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from slam_backend.core.command import TOPIC, TYPE, command, text_of
 from slam_backend.core.errors import BadConfig, BadFile, SlamError
 from slam_backend.core.measurement import SECOND
 from slam_backend.core.solvers.batch import polish
 from slam_backend.io.bags import open_bag, write_bag
 from slam_backend.io.configfile import load_config
-from slam_backend.io.encode import encode_odometry
+from slam_backend.io.encode import encode_odometry, encode_string
 from slam_backend.io.records import Record
 from slam_backend.io.replay import replay
 from slam_backend.lab.simulate import Options, simulate, write_simulation
@@ -225,6 +226,38 @@ def test_what_is_wrong_with_single_messages_is_counted_and_the_rest_is_used(driv
     summary = replay(tmp_path / "spoilt.mcap", config).result.summary
     assert sum(n for rule, n in summary["decisions"].items() if rule.startswith("decode/")) > 3
     assert summary["counts"]["keyframes"] > 200
+
+
+# -- commands ----------------------------------------------------------------------------------------
+
+
+def with_command(bag, path, text):
+    """A copy of a bag, with a command in its middle."""
+    all_ = records(bag)
+    middle = len(all_) // 2
+    asked = Record(TOPIC, TYPE, all_[middle].log_time, encode_string(text))
+    write_bag(path, [*all_[:middle], asked, *all_[middle:]])
+    return path
+
+
+def test_a_bag_that_holds_a_command_is_replayed_with_it(drive, tmp_path):
+    """Its effect is in the hash, with or without a configuration."""
+    bag, config = drive
+    copy = with_command(bag, tmp_path / "asked.mcap", text_of(command("17", "optimize", {})))
+    first, second = (replay(copy, config).result for _ in range(2))
+    assert first.summary["run_hash"] == second.summary["run_hash"] != hash_of(bag, config)
+    assert [d.verdict for d in first.decisions if d.id == "command/17"] == ["accepted"]
+    assert replay(copy).result.summary["decisions"]["command/optimize"] == 1
+
+
+def test_a_command_that_says_nothing_is_a_decision(drive, tmp_path):
+    bag, config = drive
+    copy = with_command(bag, tmp_path / "asked.mcap", '{"version": 9}')
+    result = replay(copy, config).result
+    (refused,) = [d for d in result.decisions if d.source == "command"]
+    assert (refused.verdict, refused.stage, refused.reason) == ("refused", "decode", "bad_message")
+    assert "version 9" in refused.detail
+    assert result.trajectory.sevens.tobytes() == replay(bag, config).result.trajectory.sevens.tobytes()
 
 
 # -- bad input ---------------------------------------------------------------------------------------

@@ -11,6 +11,8 @@ import pytest
 
 pytest.importorskip("rclpy")
 
+from std_srvs.srv import Trigger
+
 import slam_backend as sb
 from bench.process import stopped
 
@@ -51,6 +53,25 @@ def test_stops_and_deaths_lose_nothing(backend, peer, drive) -> None:
     summary = node.end()
     assert summary["counts"]["records"] == len(drive.records)
     assert summary["run_hash"] == node.replayed()["run_hash"] == replayed(drive)["run_hash"]
+
+
+def test_what_a_person_asks_is_part_of_the_journal(backend, peer, drive) -> None:
+    """An optimization in the midst of the drive, then the worker is killed: the run ends as the journal's replay does."""
+    node, answers = backend(drive.config), []
+
+    def ask():
+        answers.append(peer.call(Trigger, "/slam_backend/optimize"))
+
+    half = len(drive.records) // 2
+    acts = {half: ask, half + 100: lambda: os.kill(node.worker(), signal.SIGKILL)}
+    peer.play(drive.records, rate=20, extra=acts.items())
+    node.process.wait_for("the worker was lost (it ended with code -9)")
+    assert answers[0].success, answers[0].message
+    told = json.loads(answers[0].message)
+    assert told["cost"]["after"] <= told["cost"]["before"]
+    summary = node.end()
+    assert summary["decisions"]["command/optimize"] >= 1
+    assert summary["run_hash"] == node.replayed()["run_hash"] != replayed(drive)["run_hash"]
 
 
 @pytest.mark.parametrize(

@@ -1,7 +1,9 @@
 """A solver takes changes to the graph and gives estimates; SOLVERS is the list of them."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from typing import Protocol
+
+import gtsam
 
 from ..config import Config
 from ..graph import Decision, Delta, Estimate, Factor
@@ -23,6 +25,10 @@ class Solver(Protocol):
 
     def polish(self) -> Estimate:
         """Linearize everything anew at the present estimate, until that changes nothing."""
+        ...
+
+    def restart(self, factors: Iterable[Factor], values: gtsam.Values) -> Estimate:
+        """Hold exactly these factors from now on, linearized near these values; SolverFailure, with nothing changed."""
         ...
 
     def incidents(self) -> tuple[Decision, ...]:

@@ -80,6 +80,17 @@ class Isam2:
                 self._note("unpolished", error, 0)
         return self._believed
 
+    def restart(self, factors: Iterable[Factor], values: gtsam.Values) -> Estimate:
+        held, qr = {factor.id: factor for factor in factors}, self._qr
+        try:
+            self._isam, self._slots = self._climb(list(held.values()), values)
+        except _Failures as error:
+            self._qr = qr
+            raise SolverFailure(_short(error), ()) from None
+        self.factors.clear()  # others hold on to the store itself
+        self.factors.update(held)
+        return self._believed
+
     def incidents(self) -> tuple[Decision, ...]:
         told, self._incidents = tuple(self._incidents), []
         return told
