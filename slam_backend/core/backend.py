@@ -1,6 +1,5 @@
 """The back-end: measurements in, small updates out, snapshots when asked. No clock, no file, no thread, no ROS."""
 
-import json
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -23,7 +22,6 @@ from .graph import (
     Keyframe,
     Offer,
     Pose,
-    Verdict,
     landmark_key,
     total,
 )
@@ -280,20 +278,18 @@ class Backend:
 
     def _carry_out(self, command: Command) -> list[Update]:
         """What a person asks; what came of it is a decision, told with the newest keyframe."""
-        verdict: Verdict = "accepted"
+        newest = self._newest[0] if self._newest else None
+        decision = Decision(
+            newest.stamp if newest else 0, f"command/{command.id}", command.source,
+            "accepted", "command", command.action,
+        )  # fmt: skip
         try:
             outcome = self._editor.carry_out(command)
             self._revision += outcome.revised
-            detail = json.dumps({**outcome.told, "revision": self._revision})
+            decision = replace(decision, basis={**outcome.told, "revision": self._revision})
         except SlamError as error:
-            verdict, detail = "refused", str(error)
-        newest = self._newest[0] if self._newest else None
-        stamp = newest.stamp if newest else 0
-        self._decisions.append(
-            Decision(
-                stamp, f"command/{command.id}", command.source, verdict, "command", command.action, detail
-            )
-        )
+            decision = replace(decision, verdict="refused", detail=str(error))
+        self._decisions.append(decision)
         return [self._told(newest)] if newest else []
 
     # -- the way of a change ---------------------------------------------------------------------

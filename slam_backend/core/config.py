@@ -218,7 +218,7 @@ class Config(Section):
         for name in self.sources:
             if not name or "/" in name or "@" in name:
                 raise ValueError(f"source name '{name}' must not be empty or contain '/' or '@'")
-            if name in Config.model_fields or name == "gauge":
+            if name in Config.model_fields or name in ("gauge", "command"):
                 raise ValueError(f"a source cannot be called '{name}': that name has a meaning of its own")
         if len(set(self.robust)) < len(self.robust):
             raise ValueError(f"'robust' names '{max(self.robust, key=self.robust.count)}' twice")

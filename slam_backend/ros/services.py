@@ -207,8 +207,7 @@ class Services:
         decision = await self._elsewhere(lambda: session.command(action, arguments, ACTING))
         if decision.verdict != "accepted":
             raise SlamError(decision.detail)
-        content: Content = json.loads(decision.detail)
-        return content
+        return decision.basis
 
     async def _begin_anew(self) -> Content:
         if not self._resetting.acquire(blocking=False):

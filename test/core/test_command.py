@@ -1,7 +1,5 @@
 """Commands: what a person asks is a record of the stream, understood or refused, and done in its place."""
 
-import json
-
 import numpy as np
 import pytest
 
@@ -82,13 +80,13 @@ def test_an_optimization_ends_at_the_optimum_and_says_what_it_did():
     before = backend.snapshot().trajectory.sevens
     updates = backend.add(command("1", "optimize", {}))
     decision = updates[-1].decisions[-1]
-    told = json.loads(decision.detail)
+    told = decision.basis
     after = backend.snapshot().trajectory.sevens
     assert (decision.id, decision.verdict, decision.stage) == ("command/1", "accepted", "command")
     assert told["cost"]["after"] <= told["cost"]["before"]
     moved = np.linalg.norm(after[:, :3] - before[:, :3], axis=1).max()
     assert told["largest_shift"]["m"] == pytest.approx(moved, rel=1e-6)
-    again = json.loads(backend.add(command("2", "optimize", {}))[-1].decisions[-1].detail)
+    again = backend.add(command("2", "optimize", {}))[-1].decisions[-1].basis
     assert again["largest_shift"]["m"] < 1e-8
     assert again["revision"] == told["revision"] == updates[-1].revision
 

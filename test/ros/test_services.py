@@ -370,7 +370,7 @@ def test_an_optimization_is_answered_and_decided(warehouse) -> None:
     assert again["largest_shift"]["m"] < 1e-6
     assert again["revision"] == content["revision"]
     names = list(warehouse.listed("decisions/command").names)
-    assert [json.loads(decision["detail"]) for decision in warehouse.query(*names)] == [content, again]
+    assert [decision["basis"] for decision in warehouse.query(*names)] == [content, again]
 
 
 def test_nothing_is_optimized_before_there_is_something(host) -> None:
