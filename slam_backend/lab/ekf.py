@@ -64,6 +64,9 @@ class Ekf:
         """A filter does not look back."""
         return self
 
+    def restart(self, factors: Iterable[Factor], values: gtsam.Values) -> Estimate:  # noqa: ARG002
+        raise SolverFailure("a filter cannot begin anew from what it has used", ())
+
     def incidents(self) -> tuple[Decision, ...]:
         return ()
 
