@@ -5,7 +5,7 @@
 # The tests speak over real DDS: with the ROS wheels, which exist for x86-64 Linux, unless a ROS install has been sourced.
 comma  := ,
 WHEELS := $(if $(ROS_DISTRO),,$(filter Linux-x86_64,$(shell uname -s)-$(shell uname -m)))
-EXTRAS ?= dev$(if $(WHEELS),$(comma)ros)
+EXTRAS ?= dev$(comma)eval$(if $(WHEELS),$(comma)ros)
 
 # The newest Python that gtsam has wheels for and that can make a venv; a name on the PATH alone proves neither.
 CHECK  := import sys, venv, ensurepip; sys.exit(not (3, 11) <= sys.version_info < (3, 14))
@@ -51,7 +51,7 @@ clean:
 	rm -rf .venv demo build install log *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis
 	find . -name __pycache__ -not -path './.git/*' -prune -exec rm -rf {} +
 
-# One stamp per set of extras: `base` has none, `dev,ros` has two. Where the ROS wheels cannot be installed, the rest is.
+# One stamp per set of extras: `base` has none, `dev,eval` has two. Where the ROS wheels cannot be installed, the rest is.
 .venv/.stamp-%: WANTED = $(patsubst %,'.[%]',$* $(filter-out $*,$(subst $(comma)ros,,$*)))
 .venv/.stamp-%: setup.py constraints.txt
 	@test -n "$(PYTHON)" || { echo "make: no Python 3.11, 3.12 or 3.13 that can make a venv; say which: make PYTHON=..." >&2; exit 1; }

@@ -51,7 +51,7 @@ setup(
             "ros-jazzy-rclpy==7.1.6",
             "ros-rclpy[fastrtps]==7.1.6",
         ],
-        "eval": ["evo"],
+        "eval": ["evo>=1.38"],
         "lidar": ["map-closures", "small_gicp"],
         "vision": ["opencv-python-headless"],
         "rerun": ["rerun-sdk"],

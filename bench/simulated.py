@@ -10,6 +10,7 @@ from slam_backend.core.measurement import Array
 from slam_backend.core.trajectory import Trajectory
 from slam_backend.io.configfile import load_config
 from slam_backend.io.replay import replay
+from slam_backend.lab.evaluate import evaluate
 from slam_backend.lab.simulate import simulate, write_simulation
 
 TITLE = "A simulated city, seed 1, 5,000 poses"
@@ -44,12 +45,8 @@ def _truth(path: Path) -> tuple[Array, Array]:
 
 
 def ate(trajectory: Trajectory, truth: Trajectory) -> float:
-    """Position RMSE after the rigid alignment of least squares (Umeyama, 1991, without scale)."""
-    ours, theirs = trajectory.sevens[:, :3], truth.at(trajectory.stamps)[:, :3]
-    a, b = ours - ours.mean(axis=0), theirs - theirs.mean(axis=0)
-    u, _, vt = np.linalg.svd(a.T @ b)
-    flip = np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))])
-    return float(np.sqrt(np.mean(np.sum((a @ u @ flip @ vt - b) ** 2, axis=1))))
+    """Position RMSE after the rigid alignment of least squares."""
+    return evaluate(trajectory, truth).ate["rmse"]
 
 
 if __name__ == "__main__":

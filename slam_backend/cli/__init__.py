@@ -30,6 +30,7 @@ VERBS: Mapping[
     "convert": "A pose graph or trajectory from one format to another.",
     "report": "A page that answers what people ask of a run.",
     "query": "Poses at any stamp, covariances, landmarks, decisions of a finished run.",
+    "evaluate": "How far a run is from the truth: ATE, RPE.",
 }
 
 TRACEBACK = "SLAM_BACKEND_TRACEBACK"

@@ -1,0 +1,84 @@
+"""`slam-backend evaluate RUN --truth F`: how far a run, or a trajectory file, is from the truth."""
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import typer
+
+if TYPE_CHECKING:
+    from ..lab.evaluate import Errors
+
+TRAJECTORIES = ("trajectory", "online", "odometry")  # of a run directory
+
+
+def command(
+    run: Annotated[Path, typer.Argument(metavar="RUN", help="A run directory, or a trajectory file.")],
+    truth: Annotated[Path, typer.Option(metavar="F", help="TUM, KITTI, EuRoC or csv file, or a bag.")],
+    topic: Annotated[str, typer.Option(metavar="T", help="Of a bag with several topics of poses.")] = "",
+    align: Annotated[
+        Literal["none", "origin", "se2", "se3", "sim3"],
+        typer.Option(
+            help="How the estimate is laid over the truth; se2: in the plane, sim3: with its scale."
+        ),
+    ] = "se3",
+    delta: Annotated[
+        float, typer.Option(min=1e-3, help="m of path that relative errors are taken over.")
+    ] = 1.0,
+    max_difference: Annotated[float, typer.Option(min=0.0, help="s between two poses of one moment.")] = 0.01,
+    offset: Annotated[float, typer.Option(help="s to add to the stamps of the truth.")] = 0.0,
+    interpolate: Annotated[
+        bool,
+        typer.Option(help="The denser trajectory at the stamps of the other, instead of its nearest pose."),
+    ] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="All statistics as JSON.")] = False,
+) -> None:
+    """Absolute and relative pose errors against a truth, by evo (extra `eval`): the numbers of evo_ape and evo_rpe.
+
+    Of a run: of the smoothed trajectory, of what was believed at the time (online), and of odometry alone.
+    """
+    from dataclasses import asdict
+
+    from ..lab.evaluate import How, evaluate
+    from ..lab.truth import has_stamps, load_trajectory, load_truth
+
+    files = {name: run / f"{name}.tum" for name in TRAJECTORIES} if run.is_dir() else {run.name: run}
+    by_order = not (has_stamps(truth) and all(map(has_stamps, files.values())))
+    how = How(align, delta, max_difference, offset, interpolate, by_order)
+    known = load_truth(truth, topic)
+    found = {name: evaluate(load_trajectory(path), known, how) for name, path in files.items()}
+    if as_json:
+        typer.echo(
+            json.dumps({"truth": str(truth), "how": asdict(how)} | {k: asdict(e) for k, e in found.items()})
+        )
+        return
+    typer.echo(f"{run} against {truth}, {_aligned(align)}; root mean squares")
+    for line in _table(found):
+        typer.echo(line)
+
+
+def _aligned(align: str) -> str:
+    return {"none": "not aligned", "origin": "first poses laid together"}.get(
+        align, f"{align.upper()} alignment"
+    )
+
+
+def _table(found: "dict[str, Errors]") -> list[str]:
+    """A line for each trajectory."""
+    heads = ("", "poses", "ATE m", "ATE deg", "RPE m/m", "RPE deg/m", "ATE max m", "scale")
+    rows: list[tuple[Any, ...]] = [heads]
+    for name, errors in found.items():
+        numbers = [_shown(value) for value in errors.numbers().values()]
+        rows.append((name, errors.poses, *numbers, _shown(errors.ate["max"]), f"{errors.scale:.6g}"))
+    widths = [max(len(str(row[k])) for row in rows) for k in range(len(heads))]
+    return [
+        "  ".join(
+            str(cell).ljust(w) if k == 0 else str(cell).rjust(w)
+            for k, (cell, w) in enumerate(zip(row, widths, strict=True))
+        )
+        for row in rows
+    ]
+
+
+def _shown(value: float | None) -> str:
+    return "-" if value is None else f"{value:.6f}"
