@@ -15,6 +15,7 @@ every factor is its whitened Jacobian and its whitened residual, robust weight i
 import zlib
 from collections.abc import Iterable, Iterator, Sequence
 from functools import cached_property
+from itertools import accumulate
 from pathlib import Path
 from typing import Any
 from zipfile import BadZipFile
@@ -171,7 +172,8 @@ class Linearized:
             sizes = columns[end - count : end]
             block = numbers[at : at + height * sum(sizes)].reshape(height, -1)
             at += block.size
-            parts = np.split(block, np.cumsum(sizes[:-1]), axis=1)
+            right = [*accumulate(sizes)]
+            parts = [block[:, stop - size : stop] for size, stop in zip(sizes, right, strict=True)]
             yield list(zip(keys[end - count : end], parts, strict=True)), height
 
     def _fits(self) -> None:

@@ -82,6 +82,13 @@ def test_the_history_tells_each_update_and_each_loop(plane):
     assert np.abs(found - points).max() < 0.1
 
 
+def test_to_watch_a_run_does_not_change_it(plane):
+    _, out = plane
+    summary = FinishedRun(out).summary
+    alone = replay(summary["input"], load_config(out / "config.yaml"), final="batch").result
+    assert alone.summary["run_hash"] == summary["run_hash"]
+
+
 def test_what_a_loop_moved_is_what_the_online_path_jumped(plane):
     """The newest pose, carried on by odometry from where it was believed to be, lies that far from where it is believed to be after."""
     run, out = plane

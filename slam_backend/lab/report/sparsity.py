@@ -1,57 +1,55 @@
 """Why it is fast: the information matrix, and its square root in two orders of elimination."""
 
-from collections.abc import Sequence
-from itertools import pairwise
+from collections.abc import Iterator, Sequence
+from itertools import combinations
 
 import gtsam
 import numpy as np
 
-from ...core.measurement import Array
+from ...core.trajectory import Stamps
 from ...io.rundir import FinishedRun
-from .page import Section, drawn, figure, numbers, said, table
+from .page import Figure, Section, drawn, figure, numbers, said, table
 
 BINS = 240
+NATURAL = 3_000  # variables beyond which the order of time, with fill-in nearly as their square, is not tried
 INK = [[0, "white"], [1e-9, "#b9c8e6"], [1, "#1f4e9c"]]
 
 
 def section(run: FinishedRun) -> Section | None:
-    keys = run.linearized.keys
-    graph = gtsam.SymbolicFactorGraph()
-    rank = {key: n for n, key in enumerate(dict.fromkeys(key for each in keys for key in each))}
-    joint = [[rank[key] for key in each] for each in keys if len(set(each)) > 1]
-    if not joint:
+    rank = {
+        key: n for n, key in enumerate(dict.fromkeys(key for each in run.linearized.keys for key in each))
+    }
+    pairs = np.array(
+        [(rank[a], rank[b]) for each in run.linearized.keys for a, b in combinations(dict.fromkeys(each), 2)],
+        dtype=np.int64,
+    )
+    if not len(pairs):
         return None
-    for each in joint:
-        for first, second in pairwise(each):
-            graph.push_factor(first, second)
-        if len(each) > 2:
-            graph.push_factor(each[0], each[-1])
-    variables = sorted({key for each in joint for key in each})
-    in_time, colamd = gtsam.Ordering(), gtsam.Ordering.ColamdSymbolicFactorGraph(graph)
-    for key in variables:
-        in_time.push_back(key)
-    blocks = len({tuple(sorted(pair)) for each in joint for pair in pairwise(each)}) + len(variables)
-    figures, rows = {}, []
-    pairs = np.array([(a, b) for each in joint for a in each for b in each])
-    figures["information"] = _spy(pairs, variables, "information matrix, in order of time")
-    for name, ordering, title in (("in_time", in_time, "in order of time"), ("colamd", colamd, "COLAMD")):
+    pairs = np.unique(np.sort(pairs, axis=1), axis=0)
+    graph = gtsam.SymbolicFactorGraph()
+    for a, b in pairs.tolist():
+        graph.push_factor(a, b)
+    size = len(rank)
+    for n in range(size):  # those that stand alone, too
+        graph.push_factor(n)
+    blocks = len(pairs) + size
+    diagonal = np.tile(np.arange(size)[:, None], 2)
+    whole = np.vstack([pairs, pairs[:, ::-1], diagonal])
+    figures = {"information": _spy(whole, np.arange(size), "information matrix, in order of time")}
+    rows = []
+    for name, ordering, title in _orders(graph, size):
         net = _eliminated(graph, ordering)
-        filled = sum(map(len, net))
-        sizes = np.array(_cliques(net))
-        rows.append(
-            (
-                title,
-                f"{filled:,}",
-                f"{filled / blocks:.2f}",
-                len(sizes),
-                f"{sizes.mean():.1f}",
-                int(sizes.max()),
-            )
+        filled, cliques = sum(map(len, net)), np.array(_cliques(net))
+        numbers_of = f"{cliques.mean():.1f}", int(cliques.max())
+        rows.append((title, f"{filled:,}", f"{filled / blocks:.2f}", len(cliques), *numbers_of))
+        square = np.column_stack(
+            [np.repeat([each[0] for each in net], [len(each) for each in net]), np.concatenate(net)]
         )
-        square = np.array([(each[0], other) for each in net for other in each])
-        figures[name] = _spy(square, [each[0] for each in net], f"square root, {title}")
+        place = np.empty(size, dtype=np.int64)
+        place[[each[0] for each in net]] = np.arange(len(net))
+        figures[name] = _spy(square, place, f"square root, {title}")
     body = said(
-        f"{len(variables):,} variables, {blocks:,} blocks in the information matrix. Eliminating them fills in blocks; a good order keeps them few."
+        f"{size:,} variables, {blocks:,} blocks in the information matrix. Eliminating them fills in blocks; a good order keeps them few."
     )
     head = (
         "order",
@@ -65,8 +63,17 @@ def section(run: FinishedRun) -> Section | None:
     return Section("Sparsity", f'{body}{table(head, rows)}<div class="bar">{spies}</div>', figures)
 
 
+def _orders(graph: gtsam.SymbolicFactorGraph, size: int) -> Iterator[tuple[str, gtsam.Ordering, str]]:
+    if size <= NATURAL:
+        in_time = gtsam.Ordering()
+        for n in range(size):
+            in_time.push_back(n)
+        yield "in_time", in_time, "in order of time"
+    yield "colamd", gtsam.Ordering.ColamdSymbolicFactorGraph(graph), "COLAMD"
+
+
 def _eliminated(graph: gtsam.SymbolicFactorGraph, ordering: gtsam.Ordering) -> list[list[int]]:
-    """The keys of each conditional, its own first, in the order of elimination."""
+    """The variables of each conditional, its own first, in the order of elimination."""
     net = graph.eliminateSequential(ordering)
     return [list(net.at(n).keys()) for n in range(net.size())]
 
@@ -90,19 +97,18 @@ def _cliques(net: Sequence[Sequence[int]]) -> list[int]:
     return sizes
 
 
-def _spy(pairs: Array, order: Sequence[int], title: str) -> dict[str, object]:
-    """Where the blocks are, counted in at most BINS x BINS cells."""
-    place = {key: n for n, key in enumerate(order)}
-    size = len(order)
+def _spy(pairs: Stamps, place: Stamps, title: str) -> Figure:
+    """Where the blocks (row, column) are, counted in at most BINS x BINS cells. place: of each variable."""
+    size = len(place)
     cells = min(size, BINS)
-    where = np.array([[place[a], place[b]] for a, b in pairs.tolist()]) * cells // size
     counts = np.zeros((cells, cells), dtype=np.int64)
-    np.add.at(counts, (where[:, 0], where[:, 1]), 1)
+    np.add.at(counts, tuple((place[pairs] * cells // size).T), 1)
     full = max(float(np.percentile(counts[counts > 0], 95)), 1.0)
     shade = np.ceil(np.minimum(counts / full, 1.0) * 255).astype(np.uint8)
+    along = numbers(np.arange(cells) * size // cells)
     trace = {
-        "type": "heatmap", "z": {**numbers(shade), "shape": f"{cells}, {cells}"}, "x": numbers(np.arange(cells) * size // cells),
-        "y": numbers(np.arange(cells) * size // cells), "colorscale": INK, "zmin": 0, "zmax": 255, "showscale": False, "hoverinfo": "skip",
+        "type": "heatmap", "z": {**numbers(shade), "shape": f"{cells}, {cells}"}, "x": along, "y": along,
+        "colorscale": INK, "zmin": 0, "zmax": 255, "showscale": False, "hoverinfo": "skip",
     }  # fmt: skip
     drawing = figure([trace], "variable", "variable", equal=True, height=340)
     drawing["layout"]["yaxis"]["autorange"] = "reversed"
