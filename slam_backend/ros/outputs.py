@@ -8,7 +8,6 @@ import json
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
-import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseWithCovarianceStamped, TransformStamped
 from nav_msgs.msg import Odometry, Path
@@ -36,6 +35,7 @@ from ..io.encode import (
     encode_transforms,
 )
 from .drawing import drawn_graph, landmark_cloud, trajectory_cloud
+from .pose import UNKNOWN
 
 LATCHED = QoSProfile(
     depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL
@@ -57,9 +57,6 @@ OUTPUTS: dict[str, tuple[Any, QoSProfile]] = {  # name below the node's own -> t
     "map_to_odom": (TransformStamped, _reliable(10)),
 }
 TF = "/tf"
-
-# A covariance that is not determined: a kilometre and more than a full turn, rather than zeros that look certain.
-UNKNOWN = tuple(np.diag([1e6] * 6).ravel().tolist())
 
 LEVELS = {"accepted": 0, "restored": 0, "probation": 1, "refused": 2, "removed": 2}  # OK, WARN, ERROR
 STATUSES = 100  # per message

@@ -9,7 +9,7 @@ from ..core.backend import Update
 from ..core.config import Config, OdometrySource
 from ..core.graph import Motion
 from ..core.keyframes import growth
-from ..core.measurement import SECOND, Array
+from ..core.measurement import SECOND, Array, frozen
 from ..core.sensors.odometry import OdometryPose
 from ..core.space import SPACES
 
@@ -18,9 +18,13 @@ FRESH = (
 )  # ns for which a covariance serves again: it changes slowly, and costs more than the pose
 
 
+# A covariance that is not determined: a kilometre and more than a full turn, rather than zeros that look certain.
+UNKNOWN = frozen(np.diag([1e6] * 6).ravel())
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Located:
-    """`map_T_base`, its covariance (36, ROS order), and `map_T_odom`."""
+    """`map_T_base`, its covariance (36, ROS order; UNKNOWN where it is not determined), and `map_T_odom`."""
 
     seven: tuple[float, ...]
     covariance: Array
@@ -61,13 +65,15 @@ class Odometer:
 
     def _spread(self, odometry: OdometryPose, update: Update, covariance: Sequence[float] | None) -> Array:
         """The keyframe's marginal, and the odometry's noise since, seen from here."""
+        if covariance is None:
+            return UNKNOWN
         kept = self._covariance
         if kept is not None and kept[0] is update and abs(odometry.stamp - kept[1]) < FRESH:
             return kept[2]
         space = self._space
         there = space.pose(update.pose)
-        marginal = np.zeros(36) if covariance is None else np.asarray(covariance)
-        at_keyframe = Motion(there, space.covariance(marginal.reshape(6, 6), there))
+        marginal = np.reshape(covariance, (6, 6))
+        at_keyframe = Motion(there, space.covariance(marginal, there))
         here = space.pose(composed(update.correction, odometry.pose.tolist()))
         since = there.between(here)
         total = at_keyframe.then(Motion(since, growth(space, self._noise, since)))

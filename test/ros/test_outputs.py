@@ -18,7 +18,8 @@ from slam_backend.core.config import Config, PathOutput  # noqa: E402
 from slam_backend.core.graph import Decision, keyframe  # noqa: E402
 from slam_backend.core.measurement import SECOND  # noqa: E402
 from slam_backend.core.trajectory import Snapshot, Trajectory  # noqa: E402
-from slam_backend.ros.outputs import OUTPUTS, TF, UNKNOWN, Outputs  # noqa: E402
+from slam_backend.ros.outputs import OUTPUTS, TF, Outputs  # noqa: E402
+from slam_backend.ros.pose import UNKNOWN  # noqa: E402
 
 LISTENER = Path(__file__).parent / "listener.py"
 STAMP = 1_700_000_000 * SECOND + 123_456_789
@@ -135,7 +136,7 @@ def test_a_covariance_that_is_not_determined_does_not_look_certain(stage, start)
     """A kilometre, not zero."""
     process = stage.listen(start, "pose")
     stage.outputs.pose(Update(keyframe(0, STAMP), (0.0,) * 6 + (1.0,), (0.0,) * 6 + (1.0,), 0, ()), None)
-    assert stage.heard(process, "pose")["pose"]["covariance"] == list(UNKNOWN)
+    assert stage.heard(process, "pose")["pose"]["covariance"] == UNKNOWN.tolist()
 
 
 def test_path_and_clouds_arrive(stage, start) -> None:
