@@ -41,7 +41,7 @@ RUNS = "runs"  # the folder of saved runs, under data_dir
 ASIDE = "."  # begins the name of a run that is not whole yet
 SAVING = 120.0  # s that the worker may take to come to a request to save, and to do it
 ACTING = 120.0  # s that it may take to come to a command, and to carry it out
-FRESH = 0.2  # s that an answer may wait for a newer snapshot
+FRESH, FIRST = 0.2, 5.0  # s that an answer may wait for a newer snapshot, and for the first of all
 LOOK = 0.003  # s between two looks for it
 REVISION = "revision"  # as a name in a query: of the snapshot that answered
 T = TypeVar("T")
@@ -105,8 +105,9 @@ class Services:
         return session.feeder if session is not None else None
 
     def newest(self) -> Snapshot | None:
-        """The newest snapshot; when keyframes have been added since, one with them if it comes within FRESH s. Waits."""
-        held, update, until = self._state.snapshot, self._state.update, monotonic() + FRESH
+        """The newest snapshot; when keyframes have been added since, one with them if it comes in time. Waits."""
+        held, update = self._state.snapshot, self._state.update
+        until = monotonic() + (FIRST if held is None else FRESH)
         if update is None or (held is not None and len(held.indices) > update.keyframe.index):
             return held
         self._refresh()
