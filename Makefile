@@ -46,6 +46,7 @@ bench: .venv/.stamp-$(EXTRAS)
 
 docs: .venv/.stamp-$(EXTRAS)
 	$(BIN)/python -m slam_backend.lab.settings > docs/settings.md
+	$(BIN)/python -m slam_backend.lab.firewall > docs/firewall.md
 
 clean:
 	rm -rf .venv demo build install log *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis

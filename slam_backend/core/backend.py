@@ -115,7 +115,7 @@ class Backend:
         updates = []
         if self._relative and self._waiting and measurement.stamp > self._waiting.newest:
             updates = self._close()
-        self._waiting.offer(measurement)
+        self._decisions += self._waiting.offer(measurement)
         return updates
 
     def finish(self) -> list[Update]:

@@ -45,6 +45,12 @@ class Settle(Section):
     lag: float = Field(
         0.2, ge=0, le=60, description="seconds that a measurement waits for others with older stamps"
     )
+    ahead: float = Field(
+        600.0,
+        gt=0,
+        le=1e9,
+        description="seconds by which stamps may be ahead of the driving source; beyond, clocks differ: refused",
+    )
 
 
 class Isam2(Section):

@@ -24,7 +24,7 @@ class DecisionLog:
             key = (decision.source, decision.stage, decision.reason, decision.stamp // SECOND)
             if (at := self._floods.get(key)) is not None:
                 first = self._kept[at]
-                self._kept[at] = replace(first, count=first.count + 1)
+                self._kept[at] = replace(first, count=first.count + decision.count)
                 return
             self._floods[key] = len(self._kept)
         self._kept.append(decision)

@@ -75,12 +75,12 @@ class Growth:
 
     def _root(self, stamp: int) -> Delta:
         _, delta = self.start(stamp)
-        self._tracked(stamp, self._space.identity)
+        self._tracked(stamp, self._space.identity, stamp)
         return delta
 
     def _branch(self, known: Keyframe, stamp: int, step: Pose, context: Context) -> dict[int, Any]:
         new = self.follow(known, stamp)
-        self._tracked(stamp, self._track.pose(known.stamp).compose(step))
+        self._tracked(stamp, self._track.pose(known.stamp).compose(step), known.stamp)
         return {new.pose: context.pose(known.pose).compose(step)}
 
     def _added(self, stamp: int) -> Keyframe:
@@ -88,6 +88,7 @@ class Growth:
         self._timeline.add(new)
         return new
 
-    def _tracked(self, stamp: int, pose: Pose) -> None:
+    def _tracked(self, stamp: int, pose: Pose, beside: int) -> None:
         self._track.add(stamp, pose)
+        self._track.split(stamp, beside)
         self._track.protect()

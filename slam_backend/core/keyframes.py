@@ -40,6 +40,9 @@ class Track:
         self._numbers: list[tuple[float, ...]] = []
         self._covariances: list[Array] = []  # per sample; only for noise `twist` (of the step) and `pose`
         self._protected = 0  # index of the newest sample that may not be thinned away
+        self._strands: dict[
+            int, int
+        ] = {}  # stamp -> strand, of samples that share no frame with the first ones
 
     def __len__(self) -> int:
         return len(self._stamps)
@@ -63,8 +66,23 @@ class Track:
         """A keyframe stands at the newest sample: what follows is a new step."""
         self._protected = max(len(self._stamps) - 1, 0)
 
+    def split(self, stamp: int, beside: int) -> None:
+        """The sample at `stamp` lies in the frame of the one at `beside`; where these are the same, in a frame of its own.
+
+        Edges that make keyframes make as many tracks as there are parts; between two of them nothing can be interpolated.
+        """
+        strand = stamp if stamp == beside else self._strands.get(beside)
+        if strand is not None:
+            self._strands[stamp] = strand
+
     def covers(self, stamp: int) -> bool:
-        return bool(self._stamps) and self._stamps[0] <= stamp <= self._stamps[-1]
+        if not self._stamps or not self._stamps[0] <= stamp <= self._stamps[-1]:
+            return False
+        if not self._strands:
+            return True
+        right = bisect_left(self._stamps, stamp)
+        after = self._stamps[right]
+        return after == stamp or self._strands.get(after) == self._strands.get(self._stamps[right - 1])
 
     @property
     def newest(self) -> int:

@@ -1,11 +1,13 @@
 """Measurements on their way: for a keyframe that covers them, or for a variable that they need."""
 
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Callable
 from heapq import heappop, heappush
+from itertools import islice
 
 from .config import Config
 from .errors import BadConfig
+from .firewall.rules import MOST_WAITING, decided
 from .graph import Decision, Offer, Wait, identify
 from .measurement import Measurement
 
@@ -14,7 +16,7 @@ class Waiting:
     """All that has been offered and is not in the graph yet."""
 
     def __init__(self, config: Config) -> None:
-        self._sources = config.sources
+        self._sources, self._driver = config.sources, config.driver
         self._pending: list[Offer] = []
         self._asked: list[int] = []  # stamps at which a source wants a keyframe
         self._undetermined: dict[int, list[Wait]] = defaultdict(list)
@@ -28,8 +30,11 @@ class Waiting:
         """Stamp of what was offered last."""
         return self._pending[-1].measurement.stamp
 
-    def offer(self, measurement: Measurement) -> None:
-        """A measurement gets its id: the source, the stamp, and how many of that source had the same stamp before."""
+    def offer(self, measurement: Measurement) -> list[Decision]:
+        """A measurement gets its id: the source, the stamp, and how many of that source had the same stamp before.
+
+        Of a source that floods, the older half is dropped; the decision about it is returned.
+        """
         source = self._sources.get(measurement.source)
         if source is None:
             raise BadConfig(f"there is no source '{measurement.source}'; known: {', '.join(self._sources)}")
@@ -39,6 +44,21 @@ class Waiting:
         if getattr(source, "keyframe", False):
             for stamp in measurement.ends or (measurement.stamp,):
                 heappush(self._asked, stamp)
+        return [] if len(self._pending) % MOST_WAITING else self._relieved()
+
+    def _relieved(self) -> list[Decision]:
+        """Looks at all that is pending; for once in a great many offers."""
+        held = Counter(offer.measurement.source for offer in self._pending)
+        decisions = []
+        for source, count in held.items():
+            if count > MOST_WAITING // 2 and source != self._driver:
+                ours = (offer for offer in self._pending if offer.measurement.source == source)
+                gone = list(islice(ours, count // 2))
+                ids = {offer.id for offer in gone}
+                self._pending = [offer for offer in self._pending if offer.id not in ids]
+                first = gone[0].measurement
+                decisions.append(decided(first, "refused", "wait/flood", float(count), count=len(gone)))
+        return decisions
 
     def again(self, offers: list[Offer]) -> None:
         """What could not land this time."""

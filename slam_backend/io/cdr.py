@@ -16,6 +16,7 @@ from rosbags.typesys.store import Typestore
 
 from ..core import command
 from ..core.errors import BadMessage
+from ..core.firewall.rules import OVERSIZE, RULES
 from ..core.graph import Decision
 from ..core.measurement import SECOND, Array, Measurement, parse_frame
 from ..core.measurement import Decoder as SensorDecoder
@@ -141,6 +142,11 @@ class Decoder:
             if record.topic not in self._table:
                 return ()
             route = self._route(record)
+        if len(record.data) > OVERSIZE:
+            size = float(len(record.data))
+            return (
+                _refused(record, route.source, "oversize", RULES["decode/oversize"].what, size, OVERSIZE),
+            )
         data = (
             record.data if type(record.data) is bytes else bytes(record.data)
         )  # views of it must stay read-only
@@ -182,7 +188,14 @@ def _line(error: BaseException) -> str:
     return text if isinstance(error, BadMessage | SerdeError) else f"{type(error).__name__}: {text}"
 
 
-def _refused(record: Record, source: str, reason: str, detail: str) -> Decision:
+def _refused(
+    record: Record,
+    source: str,
+    reason: str,
+    detail: str,
+    statistic: float | None = None,
+    threshold: float | None = None,
+) -> Decision:
     return Decision(
         record.log_time,
         f"{record.topic}@{record.log_time}",
@@ -191,4 +204,6 @@ def _refused(record: Record, source: str, reason: str, detail: str) -> Decision:
         "decode",
         reason,
         f"{record.topic} ({record.type}): {detail}",
+        statistic,
+        threshold,
     )

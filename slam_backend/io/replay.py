@@ -70,10 +70,10 @@ def settled_stream(
     items: Iterable[Measurement | Decision], config: Config
 ) -> Iterator[Measurement | Decision]:
     """The way from decoded measurements to what the back-end takes: the same live and offline."""
-    lag = round(config.settle.lag * SECOND)
     driver = config.driver
     assert driver is not None
-    return rechecked(settled(checked(items, config), driver, lag), config)
+    lag, ahead = (round(seconds * SECOND) for seconds in (config.settle.lag, config.settle.ahead))
+    return rechecked(settled(checked(items, config), driver, lag, ahead=ahead), config)
 
 
 class Run:

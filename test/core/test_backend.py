@@ -9,6 +9,7 @@ import pytest
 from slam_backend.core.backend import Backend
 from slam_backend.core.config import Config, config_from
 from slam_backend.core.errors import BadConfig, SlamError
+from slam_backend.core.firewall.rules import MOST_WAITING
 from slam_backend.core.geometry import inverse_of, matrix_of, seven_of_matrix
 from slam_backend.core.graph import Decision, Delta
 from slam_backend.core.measurement import SECOND, frozen
@@ -316,6 +317,32 @@ def test_a_second_trajectory_is_a_part_of_its_own_until_a_loop_joins_it():
     assert [f.kind for f in backend.solver.factors.values()].count("gauge") == 1
     assert final_cost(backend) < 1e-12
     np.testing.assert_allclose(backend.snapshot().poses[-1], matrix_of(relation(1, 59)), atol=1e-6)
+
+
+def test_between_two_trajectories_nothing_lands_before_or_after_they_are_joined():
+    """Their tracks share no frame: what lies between the last keyframe of one and the first of the other has no motion."""
+    backend = Backend(config(driver="relative"))
+    items = [between(t, t + 1, relation(t, t + 1), "wheels") for t in (*range(1, 4), *range(51, 54))]
+    items += [sighting(20, (1.0, 2.0, 0.0)), sighting(2.5, (1.0, 2.0, 0.0), name="8")]
+    items += [between(2, 52, relation(2, 52), found=60), sighting(30, (1.0, 2.0, 0.0))]
+    updates = [update for item in items for update in backend.add(item)] + backend.finish()
+    decisions = [d for update in updates for d in update.decisions]
+    assert {(d.id, d.reason) for d in decisions if d.verdict == "refused"} == {
+        ("trees/20.000000000/0", "uncovered"), ("trees/30.000000000/0", "uncovered"),
+    }  # fmt: skip
+    assert backend.snapshot().names == ("8",)
+
+
+def test_of_a_flood_at_a_parked_robot_the_oldest_are_dropped_with_a_count():
+    backend = Backend(config(keyframes={"distance": 1.0}))
+    backend.add(odometry(1, seven()))
+    extra, seen = 1000, sighting(1.1, (1.0, 2.0, 0.0))
+    for _ in range(MOST_WAITING + extra):
+        backend.add(seen)
+    assert len(backend._waiting._pending) == MOST_WAITING // 2 + extra
+    updates = [update for t in (2, 3) for update in backend.add(odometry(t, seven(2.0 * t)))]
+    (flood,) = [d for update in updates for d in update.decisions if d.stage == "wait"]
+    assert (flood.verdict, flood.reason, flood.count) == ("refused", "flood", MOST_WAITING // 2)
 
 
 def test_landmarks_move_with_their_part_and_what_waited_for_the_joint_is_used():

@@ -83,6 +83,11 @@ def test_a_relative_pose_needs_both_stamps(stamps):
     assert verdict(loop(stamps=stamps)) == "zero_stamp"
 
 
+@pytest.mark.parametrize("stamps", [(SECOND, 1 << 61), (10**300, SECOND)])
+def test_a_stamp_that_no_header_can_say_is_refused(stamps):
+    assert verdict(loop(stamps=stamps)) == "far_stamp"
+
+
 @DIMENSIONS
 @pytest.mark.parametrize("make", [wheels, loop, localized])
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf, 1e308, 1.1e9])
@@ -148,7 +153,9 @@ INDEFINITE = entry(0, 1, 0.07) + entry(1, 0, 0.07) - GOOD  # correlation 1.17
         (np.eye(6) * 1e12, "covariance_absurd"),
         (np.eye(6) * 1e308, "covariance_absurd"),
         (np.diag([1e12, 1e12, 1, 1, 1, 1e11]), "kept"),
-        (np.eye(6) * 1e-300, "kept"),
+        (np.eye(6) * 1e-300, "covariance_tiny"),
+        (entry(0, 0, 4e-323), "covariance_tiny"),  # an integer 8 in a float64 field
+        (np.eye(6) * 1e-17, "kept"),
         (np.zeros((6, 6)), "kept accepted check/zero_covariance"),
         (entry(0, 0, 0.0), "kept accepted check/zero_covariance"),
         (np.diag([0, 1, 1, 1, 1, 1]) + 0.1 * (np.eye(6, k=1) + np.eye(6, k=-1)), "covariance_indefinite"),
@@ -161,6 +168,27 @@ def test_covariances_are_judged_on_the_axes_that_the_space_uses(space, covarianc
     assert verdict(localized(covariance), settings) == rule
     assert verdict(wheels(covariance=covariance), posed) == rule
     assert verdict(wheels(twist_covariance=covariance), twisted) == rule
+
+
+def test_a_variance_without_bounds_becomes_a_large_one_correlated_with_nothing():
+    """Some say 'unknown' with the largest double: the other axes are still worth something."""
+    given = entry(0, 0, 1e308) + entry(0, 1, 1e100) + entry(1, 0, 1e100) - 2 * GOOD
+    told, kept = checked([loop(given)], config())
+    assert (told.reason, told.ends) == ("covariance_capped", None)
+    expected = GOOD.copy()
+    expected[0, 0] = 1e12
+    np.testing.assert_allclose(kept.covariance.reshape(6, 6), expected, rtol=1e-12)
+    assert not kept.covariance.flags.writeable
+
+
+def test_rotation_before_translation_is_noticed():
+    """GTSAM's order in a planar robot's message, and a GNSS-like position in the place of the rotation."""
+    planar = np.diag([0.0, 0.0, 0.03, 0.1, 0.1, 0.0])
+    spatial = np.diag([0.01, 0.01, 0.02, 25.0, 25.0, 100.0])
+    assert verdict(localized(planar), config("2d")) == "kept accepted check/covariance_swapped"
+    assert verdict(loop(spatial), config("3d")) == "kept accepted check/covariance_swapped"
+    for usual in ([1e-3, 1e-3, 1e6, 1e6, 1e6, 1e3], [0.25, 0.25, 0, 0, 0, 0.07], [1, 1, 1, 1, 1, 1]):
+        assert "swapped" not in verdict(localized(np.diag(usual)), config("3d"))
 
 
 def test_only_the_covariance_that_is_used_is_judged():
@@ -272,6 +300,13 @@ def test_sightings_are_judged_by_their_form(space, item, rule):
     assert verdict(item, config(space)) == rule
 
 
+@pytest.mark.parametrize(
+    ("spoilt", "rule"), [({"landmark": ""}, "landmark_id"), ({"form": "smell"}, "landmark_kind")]
+)
+def test_a_landmark_needs_a_name_and_a_form_that_is_known(spoilt, rule):
+    assert verdict(replace(sighted(), **spoilt)) == rule
+
+
 def test_noise_that_is_not_stated_may_be_nan_in_its_whole_row_and_column():
     partly = np.array([[0.1, np.nan, 0], [np.nan, np.nan, np.nan], [0, np.nan, 0.1]])
     assert verdict(sighted(covariance=partly)) == "kept"
@@ -319,6 +354,20 @@ def test_a_duplicated_teleport_is_no_witness_of_itself():
 
 def test_small_steps_may_jump_by_a_burst():
     assert judged(at(1, 0), at(1.001, 0.9)) == ["0@1", "0.9@1.001"]
+
+
+def test_a_message_from_another_frame_is_refused_unless_the_frame_has_changed_for_good():
+    other = {s: replace(at(s, s), frame="visual_odom") for s in (2, 2.5, 3, 4)}
+    assert judged(at(1, 0), other[2], at(3, 2), other[4], at(5, 4)) == [
+        "0@1", "refused frame_changed@2", "2@3", "refused frame_changed@4", "4@5",
+    ]  # fmt: skip
+    assert judged(at(1, 0), other[2], other[3], other[4]) == [
+        "0@1",
+        "accepted restart@3",
+        "0@2",
+        "1@3",
+        "2@4",
+    ]
 
 
 @DIMENSIONS

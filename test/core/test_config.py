@@ -111,7 +111,7 @@ def wheels(**settings) -> dict:
     [
         ({"keyframe": {}}, ["keyframe:", "did you mean 'keyframes'?"]),
         ({"settle": {"lagg": 1}}, ["settle.lagg:", "did you mean 'lag'?"]),
-        ({"settle": {"xyzzy": 1}}, ["settle.xyzzy:", "known: lag"]),
+        ({"settle": {"xyzzy": 1}}, ["settle.xyzzy:", "known: ahead, lag"]),
         (wheels(max_sped=3), ["wheels.max_sped:", "did you mean 'max_speed'?"]),
         ({**wheels(), "wheel": {"kind": "landmark"}}, ["wheel:", "there is no such setting"]),
     ],

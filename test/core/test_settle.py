@@ -4,6 +4,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
+from slam_backend.core.firewall.rules import MOST_WAITING
 from slam_backend.core.graph import Decision
 from slam_backend.core.measurement import SECOND, Measurement, StaticTransform, frozen
 from slam_backend.core.settle import settled
@@ -70,6 +71,40 @@ def test_the_driver_itself_is_refused_when_late_but_not_within_the_lag():
     left = list(settled(wheels(10, 20, 16, 14, 30), DRIVER, lag=5))
     assert names(left) == ["wheels@10", "settle/backward", "wheels@16", "wheels@20", "wheels@30"]
     assert left[1].verdict == "refused"
+
+
+def test_one_stamp_from_the_far_future_costs_one_message():
+    far = wheels(1 << 60)
+    left = names(settled([*wheels(10, 20), *far, *wheels(30, 40), *said("loops", 25)], DRIVER, lag=5))
+    assert left == [
+        "wheels@10", "settle/jump", "wheels@20", "wheels@30", "settle/late", "loops@25", "wheels@40",
+    ]  # fmt: skip
+
+
+def test_what_is_too_far_ahead_of_the_driver_is_refused():
+    left = list(settled([*wheels(1, 2), *said("gps", 90, 120), *wheels(3)], DRIVER, lag=0, ahead=100))
+    assert names(left) == ["wheels@1", "settle/ahead", "wheels@2", "wheels@3", "gps@90"]
+    assert (left[1].statistic, left[1].threshold) == (118 / SECOND, 100 / SECOND)
+
+
+def test_before_the_driver_has_spoken_nothing_is_ahead_of_it():
+    assert names(settled([*said("gps", 1 << 60), *wheels(1, 2)], DRIVER, lag=0, ahead=1)) == [
+        "wheels@1", "wheels@2", f"gps@{1 << 60}",
+    ]  # fmt: skip
+
+
+def test_of_a_flood_the_oldest_are_dropped_and_counted_and_no_other_source_suffers():
+    flood = said("camera", *range(10, 10 + 2 * MOST_WAITING))
+    left = list(settled([*wheels(1, 2), *said("loops", 5), *flood], DRIVER, lag=0))
+    dropped = [item for item in left if isinstance(item, Decision)]
+    kept = [item.stamp for item in left if isinstance(item, Measurement) and item.source == "camera"]
+    assert {f"{d.source} {d.verdict} {d.reason}" for d in dropped} == {"camera refused flood"}
+    assert sum(d.count for d in dropped) + len(kept) == len(flood)
+    assert len(kept) <= MOST_WAITING
+    assert kept == [item.stamp for item in flood[-len(kept) :]]
+    assert [i.source for i in left if isinstance(i, Measurement) and i.source != "camera"] == [
+        "wheels"
+    ] * 2 + ["loops"]
 
 
 def test_decisions_and_static_transforms_pass_at_once():

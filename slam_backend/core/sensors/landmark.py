@@ -2,9 +2,10 @@
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Any, Literal, get_args
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..config import LandmarkSource
 from ..context import Context, Unusable, defaulted, each
@@ -16,7 +17,9 @@ from ..robust.kernels import noise_of
 from ..space import Space
 
 Form = Literal["position", "bearing_range", "bearing"]
+FORMS = frozenset(get_args(Form))
 
+COUNTABLE = 2.0**53  # of double precision
 NEAREST = 1e-6  # m; nearer, a landmark has no direction
 
 
@@ -28,6 +31,7 @@ class LandmarkObservation(Measurement):
     position  x y z (m)                       3x3
     bearing_range  azimuth elevation range    3x3
     bearing   azimuth elevation (rad)         2x2
+    landmark: its name; empty where the message has none that can be.
     NaN on the diagonal of the covariance means: use the configured default. In 2-D z and elevation are not used.
     """
 
@@ -61,15 +65,21 @@ def decode_points(message: Message, source: str) -> Iterable[LandmarkObservation
     else:
         raise BadMessage("point cloud of landmarks has neither 'x' and 'y' nor 'azimuth'")
     values = scalars({"z": zero, "elevation": zero, **table}, ("id", *axes))[:, 1:]
-    for n in range(count):
+    for n, name in enumerate(_names(table["id"])):
         yield LandmarkObservation(
-            stamp, source, frame, _name(table["id"][n]), form,
+            stamp, source, frame, name, form,
             frozen(values[n]), frozen(_covariance(table, n, axes)),
         )  # fmt: skip
 
 
-def _name(value: float) -> str:
-    return str(int(value)) if float(value).is_integer() else repr(float(value))
+def _names(ids: NDArray[Any]) -> list[str]:
+    """Empty for what cannot be told apart from other names: NaN, infinity, floats too large to count by ones."""
+    if ids.dtype.kind != "f":
+        return [str(value) for value in ids.tolist()]
+    return [
+        "" if not abs(value) < COUNTABLE else str(int(value)) if value.is_integer() else repr(value)
+        for value in ids.tolist()
+    ]
 
 
 def _covariance(table: dict[str, Array], n: int, axes: tuple[str, ...]) -> Array:

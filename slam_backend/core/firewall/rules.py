@@ -1,0 +1,183 @@
+"""The table of the firewall: every rule with its severity, what it says, and what to do about it.
+
+An id is `stage/reason`, as in decisions. The live node, `replay` and `doctor` judge by the same rules, /diagnostics takes
+severity and advice from here, and docs/firewall.md is this table.
+"""
+
+from collections.abc import Mapping
+from typing import Literal, NamedTuple
+
+from ..config import OdometrySource, Settle
+from ..graph import Decision, Verdict
+from ..measurement import Measurement, format_stamp
+
+Severity = Literal["note", "warn", "error"]
+
+LATEST = 1 << 31  # s since 1970
+FARTHEST = 1e9  # m; beyond, double precision has no micrometres left
+QUATERNION_TOLERANCE = 0.1  # of the squared norm; less is normalized
+ABSURD_VARIANCE = 1e12  # m^2 or rad^2 on every used axis: a way to say "unknown"; no factor can come of it
+TINY_VARIANCE = 1e-18  # m^2 or rad^2: a sigma of a nanometre; what an integer in a float64 field looks like
+ASYMMETRY = 1e-6  # relative to the largest entry
+JITTER = 1.0  # m that a step may jump besides max_speed: odometry arrives in bursts
+JUMP = 1.0  # s that stamps of the driving source may leap ahead before the next message is asked
+USUAL = 4.0  # times its last step: slow sources leap by habit
+SILENCE = 10.0  # s without the driving source that are worth a note
+EPOCH = 3600.0  # s; a leap beyond is a clock that was set, not a pause
+OVERSIZE = 8 << 20  # bytes of one message
+MOST_WAITING = 50_000  # measurements of one source that wait: for the driving source, or for a keyframe
+
+
+class Rule(NamedTuple):
+    """severity: note: nothing is lost; warn: messages are lost or weakened; error: the source is of no use until it is mended.
+    threshold: what the statistic of a decision is compared with; setting: where it comes from, if it can be changed.
+    """
+
+    severity: Severity
+    what: str
+    advice: str
+    threshold: float | None = None
+    unit: str = ""
+    setting: str = ""
+
+
+_DEFAULTS = OdometrySource(), Settle()
+_CLOCK = "use one clock for all of the robot (chrony or PTP; use_sim_time everywhere or nowhere)"
+_STAMP = "set header.stamp to the moment of the measurement"
+_COVARIANCE = "mend its covariance; all zeros mean: use the configured default"
+
+RULES: Mapping[str, Rule] = {
+    # -- bytes ---------------------------------------------------------------------------------------------------
+    "decode/bad_message": Rule(
+        "warn", "the bytes or fields of the message make no sense",
+        "record or send it anew; its definition must be the one it was written with",
+    ),
+    "decode/unknown_type": Rule(
+        "error", "a source of this kind has no messages of this type", "give the source another kind or another topic",
+    ),
+    "decode/oversize": Rule(
+        "error", "the message is larger than any of its kind should be",
+        "is it the right topic? send large batches in parts", OVERSIZE, "bytes",
+    ),
+    # -- stamps --------------------------------------------------------------------------------------------------
+    "check/zero_stamp": Rule("error", "a stamp is zero or negative", _STAMP, 0.0, "ns"),
+    "check/far_stamp": Rule("warn", "a stamp is beyond what a ROS header can say", _STAMP, LATEST, "s"),
+    "settle/ahead": Rule(
+        "error", "the stamp is too far ahead of the driving source", _CLOCK, _DEFAULTS[1].ahead, "s", "settle.ahead"
+    ),
+    "settle/jump": Rule(
+        "warn", "a lone message of the driving source leaps ahead; the next one does not follow it", _STAMP, JUMP, "s"
+    ),
+    "settle/clock_jump": Rule(
+        "error", "the clock of the driving source was set",
+        "record after the clock is synchronized; live, on_clock_jump: reset begins a new session", EPOCH, "s",
+    ),
+    "settle/backward": Rule(
+        "warn", "the driving source goes back in time by more than settle.lag",
+        "is it published twice, or is a bag looped? else raise settle.lag", 0.0, "s", "settle.lag",
+    ),
+    "settle/late": Rule(
+        "note", "it came after its turn; taken at its own stamp", "if it is often so, raise settle.lag", 0.0, "s", "settle.lag"
+    ),
+    "settle/gap": Rule(
+        "note", "the driving source was silent; motion goes straight across", "look for lost messages or a stalled driver",
+        SILENCE, "s",
+    ),
+    "recheck/duplicate": Rule(
+        "warn", "a second message with this stamp", "look for two publishers, or a topic recorded twice"
+    ),
+    # -- values --------------------------------------------------------------------------------------------------
+    "check/not_finite": Rule(
+        "warn", "a number is NaN, infinite or beyond 1e9", "mend the node that sends it: it diverged or never started", FARTHEST
+    ),
+    "check/quaternion": Rule(
+        "error", "the quaternion is not of unit length", "fill in the orientation (no rotation is 0 0 0 1), normalized", 1.0
+    ),
+    "check/range": Rule("warn", "the landmark is where the sensor is, or behind it", "drop returns without an echo", 0.0, "m"),
+    "recheck/teleport": Rule(
+        "warn", "a lone jump, faster than max_speed allows", "raise max_speed of the source if the robot is that fast",
+        _DEFAULTS[0].max_speed, "m/s", "<odometry>.max_speed",
+    ),
+    "recheck/restart": Rule(
+        "warn", "the odometry jumped and stayed there: its frame moved, the robot did not",
+        "find out why the odometry was reset", _DEFAULTS[0].max_speed, "m/s", "<odometry>.max_speed",
+    ),
+    # -- covariances: only the block that the space uses ---------------------------------------------------------
+    "check/zero_covariance": Rule(
+        "warn", "a variance of zero takes the configured default", "state a variance, or set the sigmas of the source", 0.0
+    ),
+    "check/covariance_swapped": Rule(
+        "warn", "rotation seems to stand before translation", "ROS wants x y z first, then rotations about x y z"
+    ),
+    "check/covariance_capped": Rule(
+        "note", "a variance beyond 1e12 counts as 1e12, correlated with nothing", "state 1e12 for: unknown", ABSURD_VARIANCE
+    ),
+    "check/covariance_not_finite": Rule("error", "the covariance holds NaN or infinity", _COVARIANCE),
+    "check/covariance_negative": Rule("error", "a variance is negative", _COVARIANCE, 0.0),
+    "check/covariance_absurd": Rule(
+        "warn", "every used variance says: unknown", "nothing, if its sender means: lost", ABSURD_VARIANCE
+    ),
+    "check/covariance_tiny": Rule(
+        "error", "a variance is absurdly small", "state a true one (was an integer written into a float64 field?)", TINY_VARIANCE
+    ),
+    "check/covariance_asymmetric": Rule(
+        "error", "the covariance is not symmetric", "write all 36 numbers, row by row, in float64", ASYMMETRY
+    ),
+    "check/covariance_indefinite": Rule(
+        "error", "the covariance is not positive definite",
+        "write all 36 numbers, row by row; an axis of zero variance has no correlations", 0.0,
+    ),
+    "check/information_not_finite": Rule("error", "the information holds NaN or infinity", "mend the edge in the file"),
+    "check/information_indefinite": Rule(
+        "error", "the information is not positive definite", "mend the edge in the file", 0.0
+    ),
+    # -- frames and names ----------------------------------------------------------------------------------------
+    "recheck/frame_changed": Rule(
+        "error", "a message from another frame than those before and after", "look for two publishers on the topic"
+    ),
+    "*/unknown_frame": Rule(
+        "error", "nobody says where this frame is on the robot", "add it to 'extrinsics' or send it on /tf_static"
+    ),
+    "check/landmark_id": Rule("warn", "the id is no number", "give each landmark a whole number, the same at each sighting"),
+    "check/landmark_kind": Rule(
+        "error", "there is no landmark of this kind", "send position, bearing and range, or bearing: see docs/messages.md"
+    ),
+    # -- amounts -------------------------------------------------------------------------------------------------
+    "settle/flood": Rule(
+        "error", "more wait for the driving source than memory should hold; the oldest are dropped",
+        "throttle the source; see that the driving source keeps coming", MOST_WAITING, "messages",
+    ),
+    "wait/flood": Rule(
+        "error", "more wait for a keyframe than memory should hold; the oldest are dropped",
+        "throttle the source, or set keyframes.time so that a parked robot makes keyframes", MOST_WAITING, "messages",
+    ),
+    "*/uncovered": Rule("warn", "no trajectory at its stamp", f"see that the driving source covers it; {_CLOCK}"),
+}  # fmt: skip
+
+
+def rule_of(id_: str) -> Rule | None:
+    """The rule of a decision's `stage/reason`; None for verdicts that are not the firewall's."""
+    return RULES.get(id_) or RULES.get(f"*/{id_.partition('/')[2]}")
+
+
+class Fault(Exception):  # never leaves the firewall: how a judge names the rule that refuses
+    def __init__(self, reason: str, statistic: float | None = None, threshold: float | None = None) -> None:
+        """threshold: where it is not the table's."""
+        super().__init__(reason)
+        self.reason, self.statistic, self.threshold = reason, statistic, threshold
+
+
+def decided(
+    item: Measurement,
+    verdict: Verdict,
+    id_: str,
+    statistic: float | None = None,
+    threshold: float | None = None,
+    count: int = 1,
+) -> Decision:
+    """A Decision about a record, in the words of its rule."""
+    rule, (stage, _, reason) = RULES[id_], id_.partition("/")
+    return Decision(
+        item.stamp, f"{item.source}/{format_stamp(item.stamp)}", item.source, verdict, stage, reason,
+        rule.what, statistic, rule.threshold if threshold is None else threshold, item.ends, count,
+    )  # fmt: skip

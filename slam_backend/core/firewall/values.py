@@ -1,0 +1,46 @@
+"""Numbers of one message: stamps, poses, sightings."""
+
+from math import isfinite
+
+import numpy as np
+
+from ..measurement import SECOND, Array
+from ..sensors.landmark import FORMS, LandmarkObservation, vertical
+from ..space import Space
+from .rules import FARTHEST, LATEST, QUATERNION_TOLERANCE, Fault
+
+
+def judge_stamps(*stamps: int) -> None:
+    for stamp in stamps:
+        if stamp <= 0:
+            raise Fault("zero_stamp", float(stamp))
+        if stamp >= LATEST * SECOND:
+            raise Fault("far_stamp", float(stamp // SECOND))
+
+
+def judge_pose(seven: Array, space: Space) -> None:
+    x, y, z, qx, qy, qz, qw = seven.tolist()
+    if space.name == "2d":
+        z = 0.0
+    square = qx * qx + qy * qy + qz * qz + qw * qw
+    total = x + y + z + square
+    if not isfinite(total) or max(abs(x), abs(y), abs(z)) > FARTHEST:
+        raise Fault("not_finite")
+    if abs(square - 1) > QUATERNION_TOLERANCE:
+        raise Fault("quaternion", square)
+
+
+def judge_sighting(item: LandmarkObservation, space: Space) -> tuple[int, ...]:
+    """The axes of its value that the space uses."""
+    if not item.landmark:
+        raise Fault("landmark_id")
+    if item.form not in FORMS:
+        raise Fault("landmark_kind")
+    keep = tuple(k for k in range(len(item.covariance)) if space.name == "3d" or k != vertical(item.form))
+    if not all(isfinite(v) and abs(v) < FARTHEST for v in item.value[list(keep)].tolist()):
+        raise Fault("not_finite")
+    if item.form == "bearing_range" and item.value[-1] <= 0:
+        raise Fault("range", float(item.value[-1]))
+    if item.form == "position" and not np.any(item.value[: space.point_dimension]):
+        raise Fault("range", 0.0)
+    return keep
