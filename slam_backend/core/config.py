@@ -76,6 +76,27 @@ class Isam2(Section):
     )
 
 
+class Journaling(Section):
+    """The node's journal. A record is acknowledged, and applied, once it has been written and synced to the disk."""
+
+    commit: Literal["group", "full"] = Field(
+        default="group",
+        description="what shares one sync (fsync) to the disk. group: all records that come within commit_delay; "
+        "full: nothing, each record is synced by itself and at once",
+    )
+    commit_delay: float = Field(
+        0.05,
+        ge=0,
+        le=10,
+        description="seconds that a record waits for others to be synced with; what power loss can take at most",
+    )
+    resume: Literal["unfinished", "always", "never"] = Field(
+        default="unfinished",
+        description="when a start goes on with the session in data_dir. unfinished: when its process did not end it "
+        "(kill, power loss); always: after a regular end, too; never: the journal is set aside",
+    )
+
+
 class Gate(Section):
     """Refuses a loop that contradicts the cheapest path between its ends, through odometry and accepted loops."""
 
@@ -210,6 +231,7 @@ class Config(Section):
         default="ignore",
         description="when stamps of the driving source jump back (a looped bag): start anew, or refuse them",
     )
+    journal: Journaling = Journaling()
     path: PathOutput = PathOutput()
     extrinsics: Mapping[str, tuple[float, float, float, float, float, float]] = Field(
         default_factory=dict,

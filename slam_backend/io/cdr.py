@@ -6,7 +6,7 @@ CDR: each number lies at a multiple of its size, counted from the end of the 4-b
 """
 
 import struct
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from struct import Struct
 from typing import Any, NamedTuple
 
@@ -19,10 +19,10 @@ from ..core.errors import BadMessage
 from ..core.firewall.rules import OVERSIZE, RULES
 from ..core.graph import Decision
 from ..core.measurement import SECOND, Array, Measurement, parse_frame
-from ..core.measurement import Decoder as SensorDecoder
 from ..core.sensors import SENSORS
 from ..core.sensors.odometry import STILL, UNKNOWN, OdometryPose
 from ..core.sensors.relative import RelativePose
+from . import events
 from .records import Record
 
 Outcome = Measurement | Decision
@@ -41,9 +41,11 @@ _NONSENSE = (
 )  # fmt: skip
 
 
-DECODERS: Mapping[str, Mapping[str, SensorDecoder]] = {  # kind of a source -> type -> the long way
+_Slow = Callable[[Any, str], Measurement | Iterable[Outcome]]  # (message, source)
+DECODERS: Mapping[str, Mapping[str, _Slow]] = {  # kind of a source -> type -> the long way
     **{kind: sensor.decoders for kind, sensor in SENSORS.items()},
     "command": command.DECODERS,
+    "session": events.DECODERS,
 }
 
 
@@ -125,7 +127,7 @@ class _Route(NamedTuple):
     source: str
     fast: _Fast | None
     names: _Names
-    slow: SensorDecoder | None
+    slow: _Slow | None
 
 
 class Decoder:

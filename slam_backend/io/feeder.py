@@ -17,7 +17,7 @@ from typing import Any
 
 from ..core.config import Config
 from ..core.errors import SlamError
-from .journal import Journal, JournalReader
+from .journal import Journal, JournalReader, Row
 from .worker import Answer, Failure, Report, Request, RequestName, serve
 
 BATCH = 500  # rows in one message to the worker
@@ -93,13 +93,13 @@ class Feeder:
     @property
     def backlog(self) -> int:
         """Rows that the worker has not read yet."""
-        return max(self._journal.committed - self._worker.applied, 0)
+        return max(self._journal.ready - self._worker.applied, 0)
 
     @property
     def _fed(self) -> int:
         """Rows that a worker may be given."""
-        held, committed = self.held, self._journal.committed
-        return committed if held is None else min(held, committed)
+        held, ready = self.held, self._journal.ready
+        return ready if held is None else min(held, ready)
 
     def pause(self, on: bool) -> None:
         """While paused, records are journaled but not fed; a worker that dies gets a successor that is fed as far as it was."""
@@ -203,6 +203,7 @@ class Feeder:
             while not (worker.gone or self._stop.is_set()):
                 try:
                     self._feed_from(JournalReader(self._journal.path), worker)
+                    self._stop.wait(PATIENCE)
                 except sqlite3.Error as error:
                     self._died(f"{self._journal.path}: cannot be read: {error}")
                     self._stop.wait(LONGEST_PAUSE)
@@ -216,14 +217,24 @@ class Feeder:
                     worker.pipe.send(request)
                 elif (ready := self._fed - worker.sent) > 0:
                     left = worker.quiet_until - worker.sent
-                    rows = reader.after(worker.sent, min(BATCH, ready, left if left > 0 else BATCH))
+                    rows = self._rows(reader, worker.sent, min(BATCH, ready, left if left > 0 else BATCH))
+                    if not rows:
+                        return  # the file has moved: it is opened again
                     worker.pipe.send(rows)
                     worker.sent = rows[-1].id
                 else:
-                    after = worker.sent if self.held is None else self._journal.committed
+                    after = worker.sent if self.held is None else self._journal.ready
                     self._journal.wait(after, PATIENCE, lambda: bool(self._requests) or worker.gone)
         finally:
             reader.close()
+
+    def _rows(self, reader: JournalReader, after: int, limit: int) -> list[Row]:
+        """From the file; in trouble those beyond it from memory."""
+        rows = self._journal.unwritten(after, limit) or reader.after(after, limit)
+        for row in rows:
+            if row.record is None:
+                self._died(f"{self._journal.path}: row {row.id} does not match its checksum: it is left out")
+        return rows
 
     def _due(self, worker: _Worker) -> Request | None:
         """The next request, once the worker has been given what a former one had read; the last one after all rows."""
@@ -233,7 +244,7 @@ class Feeder:
             request = self._requests.popleft()
             if request.id in self._answers:  # else its asker has given up
                 return request
-        if self._last is None or worker.finishing or worker.sent < self._journal.committed:
+        if self._last is None or worker.finishing or worker.sent < self._journal.ready:
             return None
         worker.finishing = True
         return self._last

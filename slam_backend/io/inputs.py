@@ -13,6 +13,7 @@ from ..core.errors import BadConfig, BadFile
 from ..core.graph import Decision
 from ..core.measurement import Measurement
 from ..core.sensors import SENSORS
+from . import events
 from .bags import Bag, Topic, open_bag
 from .cdr import DECODERS, Decoder
 from .formats import FORMATS, read_graph
@@ -23,6 +24,7 @@ TF_STATIC = "/tf_static"
 OWN: Mapping[str, tuple[str, str]] = {  # topic -> (source, kind) of what is read without being configured
     TF_STATIC: (TF_STATIC, "static"),
     command.TOPIC: ("command", "command"),
+    events.TOPIC: ("journal", "session"),
 }
 
 Stream = Iterator[Measurement | Decision]
@@ -89,18 +91,20 @@ class BagInputs(_Closing):
 
     def stream(self, config: Config) -> Stream:
         table = self._table(config)
-        self.count = sum(topic.count for name, topic in self.topics.items() if name in table)
+        self.count = sum(
+            topic.count for name, topic in self.topics.items() if name in table and name != events.TOPIC
+        )
         decoders = [Decoder(bag.typestore, table) for bag in self.bags]
         streams = [bag.records(set(table)) for bag in self.bags]
         if len(streams) == 1:
             decode = decoders[0].decode
             for record in streams[0]:
-                self.read += 1
+                self.read += not events.is_own(record)
                 yield from decode(record)
             return
         tagged = [((record, n) for record in stream) for n, stream in enumerate(streams)]
         for record, n in merge(*tagged, key=lambda pair: (pair[0].log_time, pair[0].topic)):
-            self.read += 1
+            self.read += not events.is_own(record)
             yield from decoders[n].decode(record)
 
     def vertex(self, stamp: int) -> int | None:  # noqa: ARG002  # a bag has no vertices

@@ -22,6 +22,7 @@ from ..core.errors import SlamError
 from ..core.graph import Decision, keyframe
 from ..core.measurement import Measurement
 from .cdr import Decoder
+from .events import is_own
 from .journal import Row
 from .replay import Result, Run
 from .rundir import write_run
@@ -106,9 +107,10 @@ class LiveInputs:
 
     def _decoded(self, rows: Iterable[Row]) -> Iterator[Measurement | Decision]:
         for row in rows:
-            self.read += 1
             self.applied = row.id
-            yield from self._decoder.decode(row.record)
+            if row.record is not None:
+                self.read += not is_own(row.record)
+                yield from self._decoder.decode(row.record)
 
     def answered(self, request: Request) -> Answer:
         try:

@@ -1,22 +1,30 @@
 """The journal: everything that was heard, in order, readable by anybody, whatever happens to the disk."""
 
+import shutil
 import sqlite3
 import subprocess
 import sys
 import threading
 import time
 from itertools import pairwise
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+from slam_backend.core.config import Journaling
 from slam_backend.core.errors import BadFile
+from slam_backend.io import events
 from slam_backend.io import journal as module
 from slam_backend.io.bags import open_bag
+from slam_backend.io.cdr import Decoder
 from slam_backend.io.encode import encode_odometry
+from slam_backend.io.inputs import OWN
 from slam_backend.io.journal import Journal, JournalReader
+from slam_backend.io.typestore import typestore_of
 
 ODOMETRY = "nav_msgs/msg/Odometry"
+GOLDEN = Path(__file__).parent / "golden" / "unsealed.db3"
 
 
 def message(n):
@@ -188,6 +196,140 @@ def test_memory_is_bounded_and_what_is_lost_is_counted(journal, complaints, monk
     assert (journal.waiting, journal.lost) == (50, 10)
     journal.close()
     assert "its last 50 records could not be written" in complaints[-1]
+
+
+def test_a_gap_is_confessed_in_the_journal(journal, complaints, monkeypatch) -> None:
+    """Where it lies, before all that came afterwards, and told to whoever decodes the journal."""
+    monkeypatch.setattr(module, "RETRY", 0.05)
+    monkeypatch.setattr(module, "LIMIT", 50)
+    journal._database.execute("PRAGMA max_page_count=1")
+    for n in range(67):
+        journal.append("/odom", ODOMETRY, message(n) * 10)
+    until(lambda: complaints)
+    journal._database.execute("PRAGMA max_page_count=1000000")
+    until(lambda: journal.committed >= 51)
+    journal.append("/odom", ODOMETRY, message(99))
+    journal.close()
+    found = [row.record for row in rows(journal.path)]
+    assert [record.topic for record in found] == ["/odom"] * 50 + [events.TOPIC, "/odom"]
+    gap = events.event_of(found[50].data)
+    assert gap["lost"] == 17
+    assert found[49].log_time == gap["after"] < gap["until"] <= found[50].log_time
+    (decision,) = Decoder(typestore_of(()), OWN).decode(found[50])
+    assert (decision.stage, decision.reason, decision.verdict, decision.count) == (
+        "journal",
+        "gap",
+        "refused",
+        17,
+    )
+
+
+def test_what_waits_for_the_disk_may_be_applied_from_memory(journal, complaints, monkeypatch) -> None:
+    """Only then: otherwise nothing is handed out that is not on disk."""
+    monkeypatch.setattr(module, "RETRY", 0.05)
+    journal.append("/odom", ODOMETRY, message(0))
+    assert journal.wait(0, 5)
+    assert (journal.ready, journal.committed) == (1, 1)
+    journal._database.execute("PRAGMA query_only=ON")  # as on a disk that has become read-only
+    for n in range(1, 20):
+        journal.append("/odom", ODOMETRY, message(n))
+    until(lambda: complaints)
+    assert "readonly" in complaints[0]
+    assert (journal.ready, journal.committed) == (20, 1)
+    assert journal.unwritten(0, 100) == []  # that row is in the file
+    assert [row.id for row in journal.unwritten(1, 5)] == [2, 3, 4, 5, 6]
+    assert [row.record.data for row in journal.unwritten(15, 100)] == [message(n) for n in range(15, 20)]
+    journal._database.execute("PRAGMA query_only=OFF")
+    until(lambda: journal.committed == 20)
+    assert journal.ready == 20
+    assert [row.record.data for row in rows(journal.path)] == [message(n) for n in range(20)]
+
+
+def test_a_folder_that_vanishes_is_made_anew_with_all_that_was_in_it(journal, complaints) -> None:
+    """SQLite itself would go on writing into a file that nobody sees."""
+    for n in range(300):
+        journal.append("/odom", ODOMETRY, message(n))
+    until(lambda: journal.committed == 300)
+    shutil.rmtree(journal.path.parent)
+    journal.append("/loops", ODOMETRY, message(300))
+    until(lambda: journal.committed == 301)
+    assert "had vanished" in complaints[0]
+    journal.append("/odom", ODOMETRY, message(301))
+    until(lambda: journal.committed == 302)
+    assert [row.record.data for row in rows(journal.path)] == [message(n) for n in range(302)]
+    assert len(complaints) == 1
+
+
+def test_a_file_of_somebody_else_in_its_place_is_not_touched(journal, complaints, monkeypatch) -> None:
+    """Moved away, the journal is there again."""
+    monkeypatch.setattr(module, "RETRY", 0.05)
+    journal.append("/odom", ODOMETRY, message(0))
+    until(lambda: journal.committed == 1)
+    journal.path.unlink()
+    other = sqlite3.connect(journal.path)
+    other.executescript("CREATE TABLE messages(id INTEGER PRIMARY KEY)")
+    other.close()
+    before = journal.path.read_bytes()
+    journal.append("/odom", ODOMETRY, message(1))
+    until(lambda: complaints)
+    assert "another file has taken its place" in complaints[0]
+    assert journal.path.read_bytes() == before
+    journal.path.unlink()
+    until(lambda: journal.committed == 2)
+    assert [row.record.data for row in rows(journal.path)] == [message(0), message(1)]
+
+
+@pytest.mark.parametrize("commit", ["group", "full"])
+def test_a_commit_waits_for_the_disk(tmp_path, complaints, commit) -> None:
+    """synchronous=NORMAL would leave the newest commits in the cache of the kernel; full: each record has a commit of its own."""
+    journal = Journal(tmp_path, complaints.append, Journaling(commit=commit, commit_delay=0.02))
+    assert journal._database.execute("PRAGMA journal_mode").fetchone() == ("wal",)
+    assert journal._database.execute("PRAGMA synchronous").fetchone() == (2,)  # FULL
+    commits = []
+    journal._database.set_trace_callback(lambda said: commits.append(said) if said == "COMMIT" else None)
+    for n in range(100):
+        journal.append("/odom", ODOMETRY, message(n))
+    until(lambda: journal.committed == 100)
+    journal.close()
+    assert (len(commits) == 100) == (commit == "full")
+    assert [row.record.data for row in rows(journal.path)] == [message(n) for n in range(100)]
+
+
+def test_a_row_that_rots_is_not_handed_out(journal) -> None:
+    """The others are."""
+    for n in range(20):
+        journal.append("/odom", ODOMETRY, message(n))
+    until(lambda: journal.committed == 20)
+    with sqlite3.connect(journal.path) as database:
+        database.execute("UPDATE messages SET data = ? WHERE id = 7", (message(99),))
+    found = rows(journal.path)
+    assert [row.id for row in found if row.record is None] == [7]
+    assert len(found) == 20
+
+
+def test_a_journal_from_before_there_were_checksums_goes_on_with_them(tmp_path, complaints) -> None:
+    """A file of the first release, as it lies on robots."""
+    shutil.copy(GOLDEN, tmp_path / "journal.db3")
+    with open_bag(GOLDEN) as bag:
+        before = [(record.topic, record.log_time, record.data) for record in bag.records()]
+        assert bag.damage == []
+    journal = Journal(tmp_path, complaints.append)
+    assert journal.committed == len(before) == 40
+    journal.append("/odom", ODOMETRY, message(0))
+    journal.close()
+    with open_bag(journal.path) as bag:
+        after = [(record.topic, record.log_time, record.data) for record in bag.records()]
+        assert bag.damage == []
+    assert after[:-1] == before
+    assert all(row.record is not None for row in rows(journal.path))
+
+
+def test_a_journal_of_a_later_version_is_left_alone(tmp_path, complaints) -> None:
+    shutil.copy(GOLDEN, tmp_path / "journal.db3")
+    with sqlite3.connect(tmp_path / "journal.db3") as database:
+        database.execute("PRAGMA user_version=99")
+    with pytest.raises(BadFile, match="a newer version of slam_backend has written it"):
+        Journal(tmp_path, complaints.append)
 
 
 @pytest.mark.parametrize("what", ["a file", "in a file", "no database"])

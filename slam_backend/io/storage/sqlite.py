@@ -2,7 +2,7 @@
 
 A database that was cut off cannot be opened as it is: its whole pages are copied to a temporary file and read
 by row number until SQLite complains. One with a write-ahead log or a rollback journal beside it is still in
-use, or was left by a crash: it is read with them.
+use, or was left by a crash: it is read with them. Journals of the node vouch for their rows (sealed.py).
 """
 
 import shutil
@@ -14,9 +14,11 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from .parts import Connection, Contents, Part, Row, Source, Topics
+from .sealed import UNREADABLE, is_sealed, rows_of
+from .wal import torn
 
 MAGIC = b"SQLite format 3\0"
-_UNREADABLE = (sqlite3.Error, UnicodeDecodeError)  # the latter when the schema itself is damaged
+COUNTS = "SELECT topic_id, count(*) FROM messages GROUP BY topic_id"
 
 
 class _Bag:
@@ -52,11 +54,20 @@ class _Bag:
             return None
         return log_time, connection.topic, identity, connection, data
 
+    def sealed(self) -> Contents:
+        """All messages by row number, each judged by its checksum."""
+        try:
+            for topic, count in self.database.execute(COUNTS):
+                if topic in self.topics:
+                    self.counts[self.topics[topic].topic] += count
+        except UNREADABLE as error:
+            self.source.say(f"the database is damaged: {error}")
+        parts = [Part(0, lambda topics: rows_of(self.database, self.source, self.topics, topics))]
+        return Contents(tuple(self.topics.values()), self.counts, parts)
+
     def indexed(self) -> Contents:
         """All messages in order of time, by the index of the table."""
-        for topic, count in self.database.execute(
-            "SELECT topic_id, count(*) FROM messages GROUP BY topic_id"
-        ):
+        for topic, count in self.database.execute(COUNTS):
             if topic in self.topics:
                 self.counts[self.topics[topic].topic] += count
             else:
@@ -83,7 +94,7 @@ class _Bag:
                     same.clear()
                 same.append(row)
                 last = row[0]
-        except _UNREADABLE as error:
+        except UNREADABLE as error:
             place = "the first message" if last is None else f"log time {last} ns"
             self.source.say(f"cannot be read beyond {place}: {error}; the rest is lost")
         yield from sorted(same)
@@ -98,7 +109,7 @@ class _Bag:
                 row = self.row(identity, topic, log_time, data)
                 if row is not None:
                     found.append(row[:3])
-        except _UNREADABLE as error:
+        except UNREADABLE as error:
             self.source.say(
                 f"rows after {found[-1][2] if found else 0} cannot be read: {error}; they are lost"
             )
@@ -114,7 +125,7 @@ class _Bag:
                 continue
             try:
                 answer = self.database.execute(query, (identity,)).fetchone()
-            except _UNREADABLE as error:
+            except UNREADABLE as error:
                 answer = None
                 self.source.say(f"some rows that were there cannot be fetched: {error}; they are lost")
             row = self.row(*(answer or (identity, 0, None, None)))
@@ -154,14 +165,21 @@ def _is_cut(source: Source) -> bool:
     return len(header) < 100 or (stated and source.size < pages * (65536 if page == 1 else page))
 
 
+def _contents(source: Source, database: sqlite3.Connection) -> Contents:
+    bag = _Bag(source, database)
+    return bag.sealed() if is_sealed(database, source) else bag.indexed()
+
+
 def _open_logged(source: Source, logs: list[Path], stack: ExitStack) -> Contents:
+    if lost := torn(source.path.with_name(f"{source.path.name}-wal")):
+        source.say(lost)
     try:  # a database in use is read where it lies
-        return _Bag(source, _connect(source.path, "mode=ro", stack)).indexed()
-    except _UNREADABLE:  # what a crash left needs writing before it can be read: on a copy
+        return _contents(source, _connect(source.path, "mode=ro", stack))
+    except UNREADABLE:  # what a crash left needs writing before it can be read: on a copy
         folder = Path(stack.enter_context(TemporaryDirectory()))
         for file in (source.path, *logs):
             shutil.copyfile(file, folder / file.name)
-        return _Bag(source, _connect(folder / source.path.name, "mode=rw", stack)).indexed()
+        return _contents(source, _connect(folder / source.path.name, "mode=rw", stack))
 
 
 def _recover(source: Source, why: str, stack: ExitStack) -> Contents:
@@ -169,7 +187,8 @@ def _recover(source: Source, why: str, stack: ExitStack) -> Contents:
     copy = _whole_pages(source, Path(stack.enter_context(TemporaryDirectory())))
     database = _connect(copy, "mode=ro", stack)
     database.execute("PRAGMA writable_schema=ON")  # opens a file that is shorter than its header says
-    return _Bag(source, database).recovered()
+    bag = _Bag(source, database)
+    return bag.sealed() if is_sealed(database, source) else bag.recovered()
 
 
 def open_sqlite(source: Source, stack: ExitStack) -> Contents:
@@ -180,10 +199,10 @@ def open_sqlite(source: Source, stack: ExitStack) -> Contents:
         if _is_cut(source):
             return _recover(source, "cut off", stack)
         try:
-            return _Bag(source, _connect(source.path, "immutable=1", stack)).indexed()
-        except _UNREADABLE as error:
+            return _contents(source, _connect(source.path, "immutable=1", stack))
+        except UNREADABLE as error:
             if "no such" in str(error):  # a database of something else
                 raise
             return _recover(source, str(error), stack)
-    except (*_UNREADABLE, OSError) as error:
+    except (*UNREADABLE, OSError) as error:
         raise source.bad(f"not a readable rosbag2 database: {error}; copy or record it again") from None
