@@ -47,10 +47,11 @@ def command(
     from ..io.configfile import load_config
     from ..io.history import NAME, History
     from ..io.replay import replay
-    from ..io.rundir import FinishedRun, prepare, write_run
+    from ..io.rundir import prepare, write_run
     from ..lab.ekf import ESTIMATORS
     from ..lab.picture import PICTURE, draw
     from ..lab.report import REPORT, write_report
+    from ..lab.report.subject import Subject
 
     if final == "batch" and estimator != "isam2":
         raise BadConfig("--final batch: a filter has no batch solution; leave it out, or --estimator")
@@ -65,7 +66,7 @@ def command(
     history.write(target / NAME)
     draw(run.result, target / PICTURE)
     if report:
-        write_report(FinishedRun(target), target / REPORT)
+        write_report(Subject(target), target / REPORT)
     if as_json:
         typer.echo(json.dumps(run.result.summary))
     else:

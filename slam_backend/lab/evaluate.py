@@ -11,6 +11,7 @@ from typing import Any, Literal
 import numpy as np
 
 from ..core.errors import BadFile, MissingExtra
+from ..core.geometry import seven_of_matrix
 from ..core.measurement import SECOND
 from ..core.trajectory import Trajectory
 
@@ -81,6 +82,18 @@ def evaluate(estimate: Trajectory, truth: Trajectory, how: How = How()) -> Error
         _relative(pair, relation, how.delta) for relation in ("translation_part", "rotation_angle_deg")
     )
     return Errors(ours.num_poses, float(scale), ate, turned, rpe, twisted, how.delta)
+
+
+def laid_over(estimate: Trajectory, truth: Trajectory) -> Trajectory:
+    """The truth, moved as a whole so that it fits the estimate best (SE(3)). Errors as `evaluate`."""
+    theirs, ours = _together(_for_evo(estimate), _for_evo(truth), How(interpolate=True))
+    try:
+        rotation, translation, _ = ours.align(theirs)
+    except _evo().GeometryException as error:
+        raise BadFile(f"the truth cannot be laid over the estimate: {error}") from None
+    estimate_T_truth = np.eye(4)
+    estimate_T_truth[:3, :3], estimate_T_truth[:3, 3] = rotation.T, -rotation.T @ translation
+    return Trajectory(truth.stamps, seven_of_matrix(estimate_T_truth @ truth.poses))
 
 
 @dataclass(frozen=True, slots=True)

@@ -13,6 +13,7 @@ from slam_backend.io.replay import replay
 from slam_backend.io.rundir import FinishedRun, write_run
 from slam_backend.lab.report import write_report
 from slam_backend.lab.report.sparsity import _cliques
+from slam_backend.lab.report.subject import Subject
 from slam_backend.lab.simulate import Options, simulate, write_simulation
 
 ALWAYS = ["Summary", "Trajectory", "Drift", "Residuals", "Factor graph", "Sparsity", "Timing", "Input health"]
@@ -43,7 +44,7 @@ def space(tmp_path_factory):
 
 
 def page_of(out):
-    write_report(FinishedRun(out), out / "report.html")
+    write_report(Subject(out), out / "report.html")
     return (out / "report.html").read_text()
 
 
@@ -115,6 +116,34 @@ def test_a_source_that_states_its_noise_truly_is_consistent(plane):
     verdicts = dict(re.findall(r"<tr><td>(wheels|loops|landmarks)</td>.*?<td>([^<]*)</td></tr>", page))
     assert set(verdicts) == {"wheels", "loops", "landmarks"}
     assert set(verdicts.values()) == {"consistent"}
+
+
+def test_a_filter_and_the_truth_are_drawn_beside_the_run(plane, tmp_path):
+    pytest.importorskip("evo")
+    run, out = plane
+    drive = run.inputs.paths[0]
+    arguments = ["--config", str(out / "config.yaml"), "--estimator", "ekf", "--no-report", "--out"]
+    assert main(["replay", str(drive), *arguments, str(tmp_path / "filter")]) == 0
+    page, truth = tmp_path / "page.html", drive.with_suffix(".truth.tum")
+    assert (
+        main(
+            [
+                "report",
+                str(out),
+                "--out",
+                str(page),
+                "--truth",
+                str(truth),
+                "--beside",
+                str(tmp_path / "filter"),
+            ]
+        )
+        == 0
+    )
+    rows = dict(
+        re.findall(r"<tr><td>([^<]*)</td><td>([\d.]*)</td>", page.read_text())
+    )  # the medians among them
+    assert float(rows["smoothed"]) < float(rows["filter"]) < float(rows["odometry alone"])
 
 
 def test_cliques_of_a_chain_and_of_a_full_graph() -> None:

@@ -6,7 +6,6 @@ Each section is a file with a function `section(run)`; one that has no data give
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from ...io.rundir import FinishedRun
 from . import (
     convergence,
     drift,
@@ -21,9 +20,10 @@ from . import (
     trajectory,
 )
 from .page import Section, html
+from .subject import Subject
 
 REPORT = "report.html"
-SECTIONS: Sequence[Callable[[FinishedRun], Section | None]] = (
+SECTIONS: Sequence[Callable[[Subject], Section | None]] = (
     summary.section,
     trajectory.section,
     playback.section,
@@ -38,7 +38,7 @@ SECTIONS: Sequence[Callable[[FinishedRun], Section | None]] = (
 )
 
 
-def write_report(run: FinishedRun, out: Path) -> None:
+def write_report(run: Subject, out: Path) -> None:
     """Write the page. BadFile if a file of the run is missing or damaged."""
     sections = [section for make in SECTIONS if (section := make(run)) is not None]
     out.write_text(html(summary.title(run), sections), encoding="utf-8")

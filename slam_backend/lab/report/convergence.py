@@ -1,11 +1,11 @@
 """Cost against iteration of the final batch."""
 
-from ...io.rundir import FinishedRun
 from ..colours import SMOOTHED
 from .page import Section, drawn, figure, line, said
+from .subject import Subject
 
 
-def section(run: FinishedRun) -> Section | None:
+def section(run: Subject) -> Section | None:
     batch = run.summary.get("batch")
     if not batch or not batch["iterations"]:
         return None

@@ -1,12 +1,12 @@
 """What the firewall refused or remarked on, by rule."""
 
-from ...io.rundir import FinishedRun
 from .page import Section, said, table
+from .subject import Subject
 
 ORDINARY = frozenset({"admit/unjudged"})
 
 
-def section(run: FinishedRun) -> Section:
+def section(run: Subject) -> Section:
     first: dict[str, str] = {}
     for each in run.decisions:
         first.setdefault(

@@ -6,16 +6,16 @@ from typing import Any
 import numpy as np
 
 from ...core.measurement import SECOND
-from ...io.rundir import FinishedRun
 from ..colours import LOOP, SMOOTHED
 from .page import Section, dots, drawn, figure, said, table
+from .subject import Subject
 from .verdicts import loops_of, sentence
 
 MOST = 20  # rows
 FITS = "chi-square at the end"
 
 
-def section(run: FinishedRun) -> Section | None:
+def section(run: Subject) -> Section | None:
     loops = {decision["id"]: decision for decision, _ in loops_of(run)}
     if not loops:
         return None

@@ -3,8 +3,8 @@
 import numpy as np
 
 from ...core.graph import keyframe
-from ...io.rundir import FinishedRun
 from .page import Section, drawn, figure, numbers, script_data
+from .subject import Subject
 
 KINDS = {"motion": "#8a94a6", "loop": "#3c9a5f", "landmark": "#d9822b", "pose": "#8e6bbf"}
 LOOP = list(KINDS).index("loop")
@@ -52,7 +52,7 @@ ready.neighbours.then(show);
 """
 
 
-def section(run: FinishedRun) -> Section | None:
+def section(run: Subject) -> Section | None:
     edges = _edges(run)
     if not edges:
         return None
@@ -74,7 +74,7 @@ def section(run: FinishedRun) -> Section | None:
     )
 
 
-def _edges(run: FinishedRun) -> list[tuple[int, int, int, float]]:
+def _edges(run: Subject) -> list[tuple[int, int, int, float]]:
     """The two ends of each factor (keyframes in order of stamp, then landmarks), its kind, its residual in standard deviations."""
     linear = run.linearized
     keys = [*(keyframe(index, 0).pose for index in run.indices.tolist()), *linear.landmarks]

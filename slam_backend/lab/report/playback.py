@@ -6,9 +6,9 @@ import numpy as np
 
 from ...core.measurement import SECOND, Array
 from ...core.trajectory import Stamps, Trajectory
-from ...io.rundir import FinishedRun
 from ..colours import LOOP, ODOMETRY, ONLINE, SMOOTHED
 from .page import Section, drawn, figure, line, numbers, script_data
+from .subject import Subject
 from .verdicts import entered, loops_of
 
 MOST_LOOPS = 300  # of one moment
@@ -44,7 +44,7 @@ ready.playback.then(() => { slider.value = slider.max; show(); });
 """
 
 
-def section(run: FinishedRun) -> Section | None:
+def section(run: Subject) -> Section | None:
     history = run.history
     if history is None or len(history["frame_stamps"]) < 2:
         return None
@@ -84,7 +84,7 @@ def _above(trajectory: Trajectory) -> Array:
 
 
 def _loops(
-    run: FinishedRun, stamps: Stamps, frames: Sequence[tuple[Stamps, Array]]
+    run: Subject, stamps: Stamps, frames: Sequence[tuple[Stamps, Array]]
 ) -> tuple[Array, list[int], list[int]]:
     """(S, 2) segments with gaps: the loops of each frame at the places of its own path; where each frame's begin; how many
     loops there were.

@@ -3,15 +3,15 @@
 import numpy as np
 
 from ...core.measurement import SECOND, Array, parse_stamp
-from ...io.rundir import FinishedRun
 from .page import Section, dots, drawn, figure, said, table
+from .subject import Subject
 
 COLOURS = ("#1f4e9c", "#3c9a5f", "#d9822b", "#8e6bbf", "#c0392b", "#2a9d9d", "#555555")
 MOST = 4_000  # dots of one source
 LITTLE = 3.0  # degrees of freedom left over, below which nothing can be said
 
 
-def section(run: FinishedRun) -> Section:
+def section(run: Subject) -> Section:
     linear = run.linearized
     sources = np.array([each.partition("/")[0] for each in linear.ids.tolist()])
     left = linear.redundancy()

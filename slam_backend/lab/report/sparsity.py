@@ -7,15 +7,15 @@ import gtsam
 import numpy as np
 
 from ...core.trajectory import Stamps
-from ...io.rundir import FinishedRun
 from .page import Figure, Section, drawn, figure, numbers, said, table
+from .subject import Subject
 
 BINS = 240
 NATURAL = 3_000  # variables beyond which the order of time, with fill-in nearly as their square, is not tried
 INK = [[0, "white"], [1e-9, "#b9c8e6"], [1, "#1f4e9c"]]
 
 
-def section(run: FinishedRun) -> Section | None:
+def section(run: Subject) -> Section | None:
     rank = {
         key: n for n, key in enumerate(dict.fromkeys(key for each in run.linearized.keys for key in each))
     }

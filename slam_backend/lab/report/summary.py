@@ -3,15 +3,15 @@
 from pathlib import Path
 
 from ...core.config import Config, config_to
-from ...io.rundir import FinishedRun
 from .page import Section, said, table
+from .subject import Subject
 
 
-def title(run: FinishedRun) -> str:
+def title(run: Subject) -> str:
     return ", ".join(Path(each).name for each in run.summary["input"])
 
 
-def section(run: FinishedRun) -> Section:
+def section(run: Subject) -> Section:
     told = run.summary
     counts, cost, timing = told["counts"], told["cost"], told["timing"]
     loops = f"{counts['loops_accepted']} of {counts['loops_offered']}"

@@ -3,11 +3,11 @@
 import numpy as np
 
 from ...core.measurement import SECOND
-from ...io.rundir import FinishedRun
 from .page import Section, dots, drawn, figure, line, table
+from .subject import Subject
 
 
-def section(run: FinishedRun) -> Section:
+def section(run: Subject) -> Section:
     timing = run.summary["timing"]
     update = timing["update_ms"]
     rows = [

@@ -2,15 +2,16 @@
 
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
+from itertools import cycle
 from typing import Any
 
 import numpy as np
 
 from ...core.measurement import Array
 from ...core.trajectory import Trajectory
-from ...io.rundir import FinishedRun
-from ..colours import LANDMARK, ODOMETRY, ONLINE, SMOOTHED, VERDICTS
+from ..colours import LANDMARK, ODOMETRY, ONLINE, OTHERS, SMOOTHED, TRUTH, VERDICTS
 from .page import Figure, Section, dots, drawn, figure, line, numbers, script_data
+from .subject import Subject
 from .verdicts import loops_of, sentence
 
 LAID_FLAT = 0.02  # share of the largest extent below which height is not worth a third axis
@@ -27,11 +28,16 @@ ready.path.then(() => place.on("plotly_click", event => {
 NORMALLY = "Click on a loop, and what was decided about it stands here."
 
 
-def section(run: FinishedRun) -> Section:
+def section(run: Subject) -> Section:
     lines = {
         "odometry alone": (run.odometry, ODOMETRY),
         "online (as believed while driving)": (run.online, ONLINE),
         "smoothed": (run.trajectory, SMOOTHED),
+        **{
+            name: (each, colour)
+            for (name, each), colour in zip(run.beside.items(), cycle(OTHERS), strict=False)
+        },
+        **({"truth": (run.truth, TRUTH)} if run.truth else {}),
     }
     flat = is_flat(run.trajectory)
     loops = _placed(run)
@@ -60,7 +66,7 @@ def is_flat(trajectory: Trajectory) -> bool:
     return bool(extent[2] <= LAID_FLAT * max(extent.max(), 1e-9))
 
 
-def _placed(run: FinishedRun) -> list[tuple[Mapping[str, Any], Array]]:
+def _placed(run: Subject) -> list[tuple[Mapping[str, Any], Array]]:
     """What holds of each loop, and (2, 3) where its ends lie in the smoothed path."""
     loops = loops_of(run)
     stamps = np.array([moments for _, moments in loops], dtype=np.int64).ravel()
@@ -93,7 +99,7 @@ def _segments(verdict: str, members: Sequence[int], ends: Array, flat: bool) -> 
     ]  # fmt: skip
 
 
-def _landmarks(run: FinishedRun) -> list[dict[str, Any]]:
+def _landmarks(run: Subject) -> list[dict[str, Any]]:
     if not run.landmarks:
         return []
     points = np.array(list(run.landmarks.values()))

@@ -4,18 +4,18 @@ from collections.abc import Mapping
 from typing import Any
 
 from ...core.measurement import parse_stamp
-from ...io.rundir import FinishedRun
+from .subject import Subject
 
 Loop = tuple[Mapping[str, Any], tuple[int, int]]
 
 
-def loops_of(run: FinishedRun) -> list[Loop]:
+def loops_of(run: Subject) -> list[Loop]:
     """What holds of each relative measurement, and the stamps (ns) of its two ends."""
     last = {each["id"]: each for each in run.decisions if "a" in each}
     return [(each, (parse_stamp(each["a"]), parse_stamp(each["b"]))) for each in last.values()]
 
 
-def entered(run: FinishedRun) -> dict[str, int]:
+def entered(run: Subject) -> dict[str, int]:
     """The stamp (ns) of the keyframe with which each loop came in: those of the history."""
     history = run.history
     if history is None:
