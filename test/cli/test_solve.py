@@ -1,6 +1,10 @@
 """`slam-backend solve`: what it prints, what it writes, and the one line when it cannot."""
 
 import json
+import signal
+import subprocess
+import sys
+import time
 from pathlib import Path
 from typing import get_args, get_type_hints
 
@@ -13,7 +17,8 @@ from slam_backend.core.config import KernelName
 from slam_backend.core.solvers.descent import METHODS
 from slam_backend.io.formats import read_graph, read_trajectory
 
-DATA = Path(__file__).parents[2] / "../shared/data"
+ROOT = Path(__file__).parents[2]
+DATA = ROOT / "../shared/data"
 KEYS = {"vertices", "edges", "cost_initial", "cost", "iterations", "seconds", "method"}
 needs_data = pytest.mark.skipif(not DATA.is_dir(), reason="the data lies beside the checkout")
 WEIGHT = "100 0 0 100 0 400"
@@ -102,6 +107,33 @@ def test_a_wrong_loop_is_named_by_gnc_and_weighed_down_by_a_kernel(square, capsy
     assert judged["cost"] < plain["cost"] / 10
     assert robust["cost"] < plain["cost"] / 10
     assert "wrong loops: 2-13" in solve(capsys, square, "--robust", "gnc")[1]
+
+
+def test_an_interrupt_ends_the_judging_of_loops_within_a_second(tmp_path):
+    """Sent as soon as it works, to a graph that takes many seconds."""
+    path, rng = tmp_path / "long.g2o", np.random.default_rng(0)
+    lines = [f"EDGE_SE2 {k} {k + 1} 1 0 0.01 {WEIGHT}" for k in range(8_000)]
+    lines += [
+        f"EDGE_SE2 {i} {j} 0 0 0 {WEIGHT}" for i, j in rng.integers(8_000, size=(300, 2)) if abs(i - j) > 1
+    ]
+    path.write_text("\n".join(lines) + "\n")
+    source = (
+        "import sys; from slam_backend import cli; from slam_backend.core.solvers import gnc\n"
+        "class Told(gnc.Graduation):\n"
+        "    def advance(self): print('judging', flush=True); return super().advance()\n"
+        "gnc.Graduation = Told; sys.exit(cli.main(sys.argv[1:]))\n"
+    )
+    command = [sys.executable, "-c", source, "solve", str(path), "--robust", "gnc"]
+    with subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=ROOT
+    ) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline() == "judging\n"
+        begin = time.monotonic()
+        process.send_signal(signal.SIGINT)
+        error = process.communicate(timeout=60)[1]
+    assert (process.returncode, error) == (130, "slam-backend: interrupted\n")
+    assert time.monotonic() - begin < 3.0, "a second, on a machine that does other things as well"
 
 
 def test_the_kernels_on_offer_are_those_of_the_configuration():

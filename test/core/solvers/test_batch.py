@@ -12,7 +12,6 @@ from slam_backend.core.errors import SolverFailure
 from slam_backend.core.graph import Factor
 from slam_backend.core.solvers.batch import polish, solve
 from slam_backend.core.solvers.descent import METHODS, NO_FALL, SETTLED, SMALL_STEP, Options
-from slam_backend.core.solvers.gnc import solve_gnc
 from slam_backend.core.solvers.initialize import cost_of, initialize
 from slam_backend.core.solvers.planar import adjoint, between, inverse_right_jacobian, log
 from slam_backend.core.space import SPACES
@@ -230,19 +229,6 @@ def test_the_planar_logarithm_loses_nothing_near_zero(angle):
     tangent = log(np.array([[1.0, 0.5, angle]]))[0]
     along = 1 - angle**2 / 12 - angle**4 / 720
     assert tangent == pytest.approx([along + angle / 4, along / 2 - angle / 2, angle], abs=1e-15)
-
-
-def test_wrong_loops_are_named_by_graduated_non_convexity(space):
-    factors, start = circle(space, count=60)
-    right = solve(factors, start, Options(polish=True))
-    rng = np.random.default_rng(6)
-    wrong = [
-        edge(space, i, i + 20, space.expmap(rng.normal(0, 2, space.dimension)), kind="loop")
-        for i in range(5, 35, 6)
-    ]
-    judged = solve_gnc([*factors, *wrong], start, Options(polish=True))
-    assert set(judged.refused) == {factor.id for factor in wrong}
-    assert (apart(space, judged.solution.values, right.values, start.keys()) < 1e-7).all()
 
 
 OPTIMA = {  # chi2/2, the data's README
