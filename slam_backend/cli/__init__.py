@@ -31,6 +31,7 @@ VERBS: Mapping[
     "report": "A page that answers what people ask of a run.",
     "query": "Poses at any stamp, covariances, landmarks, decisions of a finished run.",
     "evaluate": "How far a run is from the truth: ATE, RPE.",
+    "diff": "What moved in the map between two moments, and what came between them.",
 }
 
 TRACEBACK = "SLAM_BACKEND_TRACEBACK"

@@ -2,6 +2,7 @@
 
 import json
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -18,9 +19,16 @@ def command(
         typer.Argument(
             metavar="NAME...",
             help="pose@<t>, pose@<t>#cov, between@<a>,<b>, landmark/<id>, decision/<factor>; "
-            "<t>, <a>, <b>: <sec>.<nsec>, now (the last keyframe) or k<keyframe index>.",
+            "<t>, <a>, <b>: <sec>.<nsec>, now (the last keyframe) or k<keyframe index>. "
+            "map@<t>/ before any of them: as believed at t.",
         ),
     ],
+    as_of: Annotated[
+        str | None,
+        typer.Option(
+            metavar="T", help="As believed when everything up to T had been applied, and nothing later."
+        ),
+    ] = None,
     as_json: Annotated[
         bool, typer.Option("--json", help="One object: names to numbers, null: unknown.")
     ] = False,
@@ -29,11 +37,14 @@ def command(
 
     Poses are x y z qx qy qz qw of the robot in the map, `between` those of b in a; covariances 6x6 in ROS order, position first,
     about the axes of the map. Between keyframes the odometry gives the shape. Exit code 1 if one of the names has no answer.
+    Earlier beliefs are found by a replay of the run's inputs, which must be where they were.
     """
-    from ..core.query import answers
+    from ..core.query import PAST, answers
     from ..io.rundir import FinishedRun
 
-    found = answers(names, FinishedRun(run))
+    then = [f"{PAST}{as_of}/{name}" if as_of and not name.startswith(PAST) else name for name in names]
+    told = answers(then, FinishedRun(run))
+    found = [replace(answer, name=name) for name, answer in zip(names, told, strict=True)]
     if as_json:
         typer.echo(json.dumps({answer.name: _plain(answer) for answer in found}))
     for answer in found:

@@ -95,6 +95,7 @@ class Backend:
         self._mounts = Mounts(space, config.base_frame, config.extrinsics)
         self._landmarks: dict[str, int] = {}
         self._waiting = Waiting(config)
+        self._is_complete = False  # nothing was offered since the last keyframes along edges were made
         self._growth = Growth(space, self.timeline, self.track, self.parts)
         self._decisions: list[Decision] = []  # told with the next update
         self._newest: tuple[Keyframe, Pose] | None = None  # and its odometry pose
@@ -112,11 +113,20 @@ class Backend:
             return self._carry_out(measurement)
         if isinstance(measurement, OdometryPose) and measurement.source == self._driver:
             return self._drive(measurement)
-        updates = []
-        if self._relative and self._waiting and measurement.stamp > self._waiting.newest:
-            updates = self._close()
+        updates = self.complete(measurement.stamp)
         self._decisions += self._waiting.offer(measurement)
+        self._is_complete = False
         return updates
+
+    def complete(self, stamp: int) -> list[Update]:
+        """All that is older than `stamp` has been told: edges that drive the keyframes need wait no longer for their equals.
+
+        `add` does so by itself.
+        """
+        if not self._relative or self._is_complete or not self._waiting or stamp <= self._waiting.newest:
+            return []
+        self._is_complete = True
+        return self._close()
 
     def finish(self) -> list[Update]:
         """The input has ended: land what still waits; decide about what cannot land."""

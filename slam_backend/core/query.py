@@ -5,11 +5,12 @@
     between@<a>,<b>     a_T_b: x y z qx qy qz qw
     landmark/<id>       x y z in the map
     decision/<factor>   the last decision about it
+    map@<t>/<name>      any of these, as believed when everything up to t had been applied, and nothing later
 
 <t>, <a>, <b> are moments: `<sec>.<nsec>`, `now` (the last keyframe) or `k<keyframe index>`.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple, Protocol
 
@@ -24,7 +25,10 @@ from .measurement import Array, format_stamp, parse_stamp
 from .space import Space
 from .trajectory import Stamps, Trajectory, shaped
 
-FORMS = ("pose@<t>", "pose@<t>#cov", "between@<a>,<b>", "landmark/<id>", "decision/<factor>")
+FORMS = (
+    "pose@<t>", "pose@<t>#cov", "between@<a>,<b>", "landmark/<id>", "decision/<factor>", "map@<t>/<any of these>",
+)  # fmt: skip
+PAST = "map@"  # what a name begins with that asks for an earlier belief
 MOMENTS = "<sec>.<nsec>, now or k<keyframe index>"
 GTSAM_AXES = {3: (3, 4, 2), 6: (0, 1, 2, 3, 4, 5)}  # of a tangent with so many, in GTSAM's order of six
 
@@ -59,6 +63,10 @@ class Known(Protocol):
 
     def decision(self, identifier: str) -> Mapping[str, Any] | None: ...
 
+    def past(self, stamp: int) -> "Known":
+        """As believed when everything up to a stamp had been applied, and nothing later. Unknown where that cannot be told."""
+        ...
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Answer:
@@ -82,6 +90,7 @@ class Question(NamedTuple):
     kind: str  # pose, cov, between, landmark or decision
     moments: tuple[Moment, ...] = ()
     identifier: str = ""
+    past: Moment | None = None  # when it was believed; None: the newest belief
 
 
 class Unknown(SlamError):
@@ -90,27 +99,69 @@ class Unknown(SlamError):
 
 def question(name: str) -> Question:
     """BadConfig if the name has none of FORMS."""
-    kind, slash, identifier = name.partition("/")
+    when, slash, asked = name.removeprefix(PAST).partition("/")
+    if name.startswith(PAST) and slash:
+        return _question(name, asked)._replace(past=moment_of(name, when))
+    return _question(name, name)
+
+
+def _question(name: str, asked: str) -> Question:
+    """asked: the name without its beginning, which says when it was believed."""
+    kind, slash, identifier = asked.partition("/")
     if slash and identifier and kind in ("landmark", "decision"):
         return Question(name, kind, identifier=identifier)
-    kind, at, rest = name.partition("@")
+    kind, at, rest = asked.partition("@")
     when, hash_, what = rest.partition("#")
     moments = when.split(",")
     if at and kind == "pose" and len(moments) == 1 and what == ("cov" if hash_ else ""):
-        return Question(name, what or kind, (_moment(name, when),))
+        return Question(name, what or kind, (moment_of(name, when),))
     if at and kind == "between" and len(moments) == 2 and not hash_:
-        return Question(name, kind, tuple(_moment(name, text) for text in moments))
+        return Question(name, kind, tuple(moment_of(name, text) for text in moments))
     raise BadConfig(f"'{name}' is none of {', '.join(FORMS)}")
 
 
 def answers(names: Sequence[str], known: Known) -> list[Answer]:
     """One for each name, in their order. BadConfig, before anything is looked up, if one of them is malformed."""
     questions = [question(name) for name in names]
-    poses = _poses({moment for each in questions for moment in each.moments}, known)
-    return [_answer(each, known, poses) for each in questions]
+    found: dict[str, Answer] = {}
+    for then, group in _by_belief(questions, known):
+        if isinstance(then, Unknown):
+            found |= {each.name: Answer(each.name, None, str(then)) for each in group}
+            continue
+        poses = _poses({moment for each in group for moment in each.moments}, then)
+        found |= {each.name: _answer(each, then, poses) for each in group}
+    return [found[name] for name in names]
 
 
-def _moment(name: str, text: str) -> Moment:
+def _by_belief(
+    questions: Sequence[Question], known: Known
+) -> Iterator[tuple[Known | Unknown, Sequence[Question]]]:
+    """The questions by what they are asked of; earlier beliefs in order of stamp, so that one way through the past serves all."""
+    if present := [each for each in questions if each.past is None]:
+        yield known, present
+    by_stamp: dict[int, list[Question]] = {}
+    for each in questions:
+        if each.past is not None:
+            try:
+                by_stamp.setdefault(believed_at(each.past, known), []).append(each)
+            except Unknown as why:
+                yield why, [each]
+    for stamp in sorted(by_stamp):
+        try:
+            then = known.past(stamp)
+        except Unknown as why:
+            yield why, by_stamp[stamp]
+        else:
+            yield then, by_stamp[stamp]
+
+
+def believed_at(moment: Moment, known: Known) -> int:
+    """The stamp (ns) of `map@<moment>`; it may lie outside the trajectory."""
+    return _stamp(moment, known) if moment.stamp is None else moment.stamp
+
+
+def moment_of(name: str, text: str) -> Moment:
+    """BadConfig, with the name that it stands in, if the text is none."""
     if text == "now":
         return Moment()
     try:

@@ -8,7 +8,7 @@ driving source itself, late, is refused: its motion has been used. Of a source o
 """
 
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from heapq import heapify, heappop, heappush
 
 from .command import Command
@@ -26,13 +26,15 @@ def settled(
     lag: int,
     last_resort: bool = True,
     ahead: int = FAR,
+    passed: Callable[[int], object] = lambda _: None,
 ) -> Iterator[Measurement | Decision]:
     """Reorder measurements; decisions, and what has no moment of its own, pass through at once.
 
     driver: the source whose stamps move the watermark. last_resort: release what waits when the input ends.
     lag: ns. ahead: ns that other sources' stamps may be beyond its newest.
+    passed: told the watermark each time it has moved, when all that is older has been taken.
     """
-    clock, queue = Clock(lag), _Queue(driver, lag, ahead)
+    clock, queue = Clock(lag), _Queue(driver, lag, ahead, passed)
     for item in items:
         if isinstance(item, Decision | StaticTransform | Command):
             yield item
@@ -50,8 +52,8 @@ def settled(
 class _Queue:
     """What waits for the watermark. lag, ahead: ns."""
 
-    def __init__(self, driver: str, lag: int, ahead: int) -> None:
-        self._driver, self._lag, self._ahead = driver, lag, ahead
+    def __init__(self, driver: str, lag: int, ahead: int, passed: Callable[[int], object]) -> None:
+        self._driver, self._lag, self._ahead, self._passed = driver, lag, ahead, passed
         self._waiting: list[tuple[int, bool, str, int, Measurement]] = []
         self._count: Counter[str] = Counter()
         self._held: Counter[str] = Counter()
@@ -80,6 +82,7 @@ class _Queue:
         if item.stamp - self._lag > self._watermark:
             self._watermark = item.stamp - self._lag
             yield from self.released(self._watermark)
+            self._passed(self._watermark)
 
     def released(self, until: int) -> Iterator[Measurement]:
         """Take what is older than a stamp, in order."""

@@ -20,8 +20,8 @@ from ..core.decisions import DecisionLog
 from ..core.errors import BadFile
 from ..core.fingerprint import run_hash
 from ..core.graph import Decision, Factor
-from ..core.measurement import SECOND, Measurement
-from ..core.settle import settled
+from ..core.measurement import SECOND, Measurement, StaticTransform
+from ..core.settle import FAR, settled
 from ..core.solvers import SOLVERS, Solver
 from ..core.solvers.batch import Solution, polish
 from ..core.space import SPACES, Space
@@ -67,13 +67,16 @@ def replay(
 
 
 def settled_stream(
-    items: Iterable[Measurement | Decision], config: Config
+    items: Iterable[Measurement | Decision],
+    config: Config,
+    last_resort: bool = True,
+    passed: Callable[[int], object] = lambda _: None,
 ) -> Iterator[Measurement | Decision]:
-    """The way from decoded measurements to what the back-end takes: the same live and offline."""
+    """The way from decoded measurements to what the back-end takes: the same live and offline. See `settled`."""
     driver = config.driver
     assert driver is not None
     lag, ahead = (round(seconds * SECOND) for seconds in (config.settle.lag, config.settle.ahead))
-    return rechecked(settled(checked(items, config), driver, lag, ahead=ahead), config)
+    return rechecked(settled(checked(items, config), driver, lag, last_resort, ahead, passed), config)
 
 
 class Run:
@@ -86,7 +89,9 @@ class Run:
         notes: list[str],
         final: Final = "none",
         estimator: Estimator = SOLVERS["isam2"],
+        flush: bool = True,
     ) -> None:
+        """flush: at the end of the input all is applied that still waits for its turn."""
         self.config, self.notes, self.inputs = config, notes, inputs
         self._final = final
         self.batch: Solution | None = None
@@ -94,6 +99,12 @@ class Run:
         self.decisions = DecisionLog()
         self.seconds = Seconds()
         self.measurements = 0
+        self.last: Update | None = None
+        self.reached = 0  # the newest stamp that has been applied
+        self._watermark = -FAR
+        self._flush = flush
+        self._items = self._stream()
+        self._ahead: Measurement | Decision | None = None  # the head of the stream, not applied yet
         self._online: list[tuple[int, tuple[float, ...]]] = []
         self._online_cost = 0.0
         self._updates = self._run()
@@ -119,21 +130,55 @@ class Run:
         """chi2/2 of the kept factors at the last online estimate, gauges left out."""
         return self._online_cost
 
+    def reach(self, stamp: int, told: Callable[[Update], object] = lambda _: None) -> bool:
+        """Go on until the watermark has passed a stamp: all up to it is applied, and nothing beyond. False: the input ends before.
+
+        What is asked of the back-end then is what was believed when the run was there, whatever came later. told: each update.
+        """
+        for update in self._advance(stamp):
+            told(update)
+        there = self._ahead is not None or max(self._watermark - 1, self.reached) >= stamp
+        for update in self._take(self.backend.complete(stamp + 1) if there else ()):
+            told(update)
+        return there
+
     def _run(self) -> Iterator[Update]:
+        start = perf_counter()
+        yield from self._advance(FAR)
+        yield from self._finish()
+        self.seconds.wall = perf_counter() - start
+
+    def _stream(self) -> Iterator[Measurement | Decision]:
         with self.inputs:
-            stream = settled_stream(self.inputs.stream(self.config), self.config)
-            start = perf_counter()
-            while (item := next(stream, None)) is not None:
-                if isinstance(item, Decision):
-                    self.decisions.add(item)
-                    continue
-                self.measurements += 1
-                before = perf_counter()
-                updates = self.backend.add(item)
-                self.seconds.solve(perf_counter() - before, len(updates))
-                yield from self._take(updates)
-            yield from self._finish()
-            self.seconds.wall = perf_counter() - start
+            yield from settled_stream(self.inputs.stream(self.config), self.config, self._flush, self._passed)
+
+    def _passed(self, watermark: int) -> None:
+        self._watermark = watermark
+
+    def _advance(self, until: int) -> Iterator[Update]:
+        """Apply what comes; what lies beyond a stamp stays at the head of the stream."""
+        while True:
+            if self._ahead is None:
+                self._ahead = next(self._items, None)
+            item = self._ahead
+            if item is None or self._watermark > until:
+                return
+            if isinstance(item, Decision):
+                self.decisions.add(item)
+            elif item.stamp > until and not isinstance(item, StaticTransform):
+                return
+            else:
+                yield from self._apply(item)
+            self._ahead = None
+
+    def _apply(self, item: Measurement) -> Iterator[Update]:
+        self.measurements += 1
+        before = perf_counter()
+        updates = self.backend.add(item)
+        self.seconds.solve(perf_counter() - before, len(updates))
+        if not isinstance(item, StaticTransform):
+            self.reached = max(self.reached, item.stamp)
+        yield from self._take(updates)
 
     def _finish(self) -> Iterator[Update]:
         before = perf_counter()
@@ -152,6 +197,7 @@ class Run:
             self.decisions.extend(update.decisions)
             if not self._online or update.keyframe.stamp > self._online[-1][0]:
                 self._online.append((update.keyframe.stamp, update.pose))
+            self.last = update
             yield update
 
 
@@ -222,7 +268,7 @@ class Result:
         """What summary.json holds."""
         run, loops = self.run, self.decisions.loops()
         return {
-            "input": [str(path) for path in run.inputs.paths],
+            "input": [str(path.absolute()) for path in run.inputs.paths],
             "run_hash": run_hash(self.factors, self.decisions, self.values, self.trajectory.sevens),
             "config_hash": config_hash(run.config),
             "seed": 0,

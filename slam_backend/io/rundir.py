@@ -14,9 +14,11 @@ import numpy as np
 
 from ..core.config import Config, OdometrySource
 from ..core.decisions import as_json
+from ..core.difference import Difference
 from ..core.errors import BadConfig, BadFile, SlamError
 from ..core.graph import Decision
-from ..core.measurement import Array
+from ..core.measurement import Array, format_stamp
+from ..core.query import Unknown
 from ..core.space import SPACES, Space
 from ..core.trajectory import Stamps, Trajectory
 from .configfile import load_config, write_yaml
@@ -27,12 +29,14 @@ from .formats.lines import read_bytes, read_text
 from .history import NAME as HISTORY
 from .history import Recorded
 from .linearized import Linearized, write_linearized
-from .replay import Result
+from .past import Past, Then
+from .replay import Result, replay
 
 FILES = ("summary.json", "config.yaml", "trajectory.tum", "odometry.tum", "online.tum", "landmarks.csv",
          "decisions.jsonl", "graph.g2o", "linearized.npz")  # fmt: skip
 
 
+ALIKE = 1e-6  # m and of quaternions; between replays on different machines
 DRAWN = ("trajectory.png", "report.html", HISTORY)  # by the command line
 
 
@@ -263,6 +267,48 @@ class FinishedRun:
                 if isinstance(line, dict) and line.get("id") == identifier:
                     return dict(line)
         return None
+
+    def past(self, stamp: int) -> Then:
+        """By a replay of the run's inputs. BadFile if they are not there, or not those of the run any more."""
+        then = self._past.at(stamp)
+        self._compare(stamp)
+        return then
+
+    def between(self, first: int, last: int) -> Difference:
+        """What changed from one stamp to another, found in the same way. BadConfig where the run never was."""
+        if last < first:
+            raise BadConfig(f"--to {format_stamp(last)} lies before --from {format_stamp(first)}")
+        try:
+            found = self._past.between(first, last)
+        except Unknown as why:
+            raise BadConfig(f"{self.path}: {why}") from None
+        self._compare(last)
+        return found
+
+    @cached_property
+    def _past(self) -> Past:
+        estimator = self.summary.get("estimator", "isam2")
+        if estimator != "isam2":
+            raise BadFile(
+                f"{self.path}: what '{estimator}' believed earlier cannot be asked; only isam2 can be"
+            )
+        paths = [Path(path) for path in self.summary["input"]]
+        if gone := [path for path in paths if not path.exists()]:
+            raise BadFile(
+                f"{self.path}: what was believed earlier is found by a replay of its inputs, and {gone[0]} is not there; put it back"
+            )
+        return Past(lambda: replay(paths, self.config))
+
+    def _compare(self, stamp: int) -> None:
+        """What the replay believed of each keyframe when it was newest with what the run itself did."""
+        again = self._past.run_at(stamp).online
+        first = self._trajectory("online.tum")
+        same = again.stamps.tolist() == first.stamps[: len(again)].tolist()
+        if not same or np.abs(again.sevens - first.sevens[: len(again)]).max(initial=0.0) > ALIKE:
+            names = ", ".join(self.summary["input"])
+            raise BadFile(
+                f"{self.path}: a replay of {names} takes another way: the inputs have changed, or the versions"
+            )
 
     def _counted(self, name: str, found: int, counted: int) -> None:
         if found != counted:

@@ -10,7 +10,8 @@ from ..core.config import Config, OdometrySource
 from ..core.decisions import as_json
 from ..core.errors import SlamError, SolverFailure
 from ..core.graph import Decision
-from ..core.measurement import Array
+from ..core.measurement import Array, format_stamp
+from ..core.query import Known, Unknown
 from ..core.space import SPACES
 from ..core.trajectory import Snapshot, Stamps, Trajectory
 from ..io.feeder import Feeder
@@ -61,3 +62,6 @@ class Believed:
     def decision(self, identifier: str) -> Mapping[str, Any] | None:
         decision = self._decided.get(identifier)
         return None if decision is None else as_json(decision)
+
+    def past(self, stamp: int) -> Known:
+        raise Unknown(f"what was believed at {format_stamp(stamp)} cannot be asked yet")

@@ -261,3 +261,23 @@ def test_seven_thousand_keyframes_answer_within_three_seconds(tmp_path: Path) ->
     before = cpu()
     subprocess.run(command, check=True, capture_output=True, cwd=ROOT)
     assert cpu() - before < 3
+
+
+def test_earlier_beliefs_and_what_changed_since(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    lines = [f"VERTEX_SE2 {n} {n} 0 0" for n in range(6)]
+    lines += [f"EDGE_SE2 {n} {n + 1} 1 0 0 100 0 0 100 0 100" for n in range(5)]
+    (tmp_path / "line.g2o").write_text("\n".join([*lines, "EDGE_SE2 0 4 4.4 0 0 100 0 0 100 0 100"]))
+    result, run = replay(tmp_path / "line.g2o").result, tmp_path / "run"
+    write_run(result, run)
+    third = format_stamp(int(result.trajectory.stamps[3]))
+    assert cli.main(["query", str(run), "pose@now", "--as-of", third, "--json"]) == 0
+    np.testing.assert_allclose(json.loads(capsys.readouterr().out)["pose@now"][:2], [3, 0], atol=1e-9)
+    assert cli.main(["diff", str(run), "--from", third, "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert [event["id"].split("/")[0] for event in found["events"]] == ["edges"]
+    assert found["keyframes"] == [4, 6]
+    np.testing.assert_allclose([each["m"] for each in found["moved"]], [0, 0.08, 0.16, 0.24], atol=1e-6)
+    assert cli.main(["diff", str(run), "--from", third]) == 0
+    assert "3 of 4 keyframes moved" in capsys.readouterr().out
+    assert cli.main(["diff", str(run), "--from", "now", "--to", third]) == 2
+    assert cli.main(["query", str(run), "pose@now", "--as-of", "999"]) == 1

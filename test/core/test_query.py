@@ -12,7 +12,7 @@ from slam_backend.core.config import OdometrySource
 from slam_backend.core.errors import BadConfig, BadFile, SolverFailure
 from slam_backend.core.geometry import covariance_from_ros
 from slam_backend.core.measurement import SECOND, Array
-from slam_backend.core.query import FORMS, Answer, Moment, answers, question
+from slam_backend.core.query import FORMS, Answer, Moment, Unknown, answers, question
 from slam_backend.core.space import SPACES
 from slam_backend.core.trajectory import Stamps, Trajectory, shaped
 
@@ -32,6 +32,7 @@ class World:
     noise: OdometrySource = NOISE
     indices: Stamps = field(default_factory=lambda: np.array([0, 2, 1], dtype=np.int64))
     landmarks: Mapping[str, Array] = field(default_factory=lambda: {"tag36h11:5": np.array([1.0, 2, 3])})
+    asked: list[int] = field(default_factory=list)
 
     @property
     def space(self) -> Any:
@@ -53,6 +54,13 @@ class World:
 
     def decision(self, identifier: str) -> Mapping[str, Any] | None:
         return {"id": identifier, "verdict": "accepted"} if identifier == "loops/1.000000000/0" else None
+
+    def past(self, stamp: int) -> "World":
+        """Until 3 s the landmark was not known; before 1 s nothing was."""
+        self.asked.append(stamp)
+        if stamp < SECOND:
+            raise Unknown("there was no keyframe yet")
+        return World(landmarks={}) if stamp < 3 * SECOND else self
 
 
 def one(name: str, world: World | None = None) -> Answer:
@@ -86,7 +94,8 @@ def test_a_moment_is_a_stamp_in_whole_nanoseconds_now_or_a_keyframe(text: str, m
 @pytest.mark.parametrize(
     "name",
     ["", "pose", "pos@1.0", "Pose@now", "pose@1.0,2.0", "pose@now#covariance", "pose@now#", "between@now", "pose/now",
-     "between@1,2,3", "between@1,2#cov", "landmark/", "landmark", "decision/", "velocity@now", "@now", "map@now"],
+     "between@1,2,3", "between@1,2#cov", "landmark/", "landmark", "decision/", "velocity@now", "@now", "map@now",
+     "map@now/", "map@1/map@2/pose@now", "map@1/pose", "map@1"],
 )  # fmt: skip
 def test_a_name_of_no_known_form_is_answered_with_the_forms(name: str) -> None:
     with pytest.raises(BadConfig) as raised:
@@ -208,3 +217,25 @@ def test_before_the_first_keyframe_nothing_is_known() -> None:
 
     for name in ("pose@now", "pose@k0", "pose@1.0#cov", "between@now,now"):
         assert "no keyframe yet" in one(name, Nothing()).why
+
+
+def test_a_name_may_ask_what_was_believed_at_another_moment() -> None:
+    world = World()
+    names = [
+        "map@4/landmark/tag36h11:5",
+        "map@2.5/landmark/tag36h11:5",
+        "map@0.5/pose@now",
+        "map@k0/pose@k1",
+        "map@k9/pose@k1",
+    ]
+    known, unknown, before, first, never = answers(names, world)
+    assert known.value is not None
+    assert unknown.value is None
+    assert before.why == "there was no keyframe yet"
+    assert first.value is not None
+    assert "no keyframe k9" in never.why
+    assert world.asked == sorted(world.asked) == [SECOND // 2, SECOND, 5 * SECOND // 2, 4 * SECOND], (
+        "one way through the past"
+    )
+    with pytest.raises(BadConfig, match="'now-ish' is no moment"):
+        question("map@now-ish/pose@now")

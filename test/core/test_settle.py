@@ -146,3 +146,11 @@ def test_shuffles_within_the_lag_give_the_same_sequence(seed, lag):
     assert len(first) == sum(map(len, streams.values()))
     assert all(one is other for one, other in zip(first, second, strict=True))
     assert [item.stamp for item in first] == sorted(item.stamp for item in first)
+
+
+def test_the_watermark_is_told_when_all_that_is_older_has_left():
+    told = []
+    stream = settled([*wheels(1, 2), *said("loops", 1), *wheels(5)], DRIVER, 1, passed=told.append)
+    seen = [(f"{item.source}@{item.stamp}", told[-1] if told else None) for item in stream]
+    assert seen == [("loops@1", 1), ("wheels@1", 1), ("wheels@2", 1), ("wheels@5", 4)]
+    assert told == [0, 1, 4]
