@@ -11,7 +11,9 @@ from ..core.errors import BadConfig
 from .progress import progress
 
 if TYPE_CHECKING:
-    from ..io.history import History
+    from collections.abc import Callable, Sequence
+
+    from ..core.backend import Update
     from ..io.replay import Run
 
 
@@ -40,6 +42,12 @@ def command(
     report: Annotated[
         bool, typer.Option(help="Write report.html, the page that answers what people ask.")
     ] = True,
+    rerun: Annotated[
+        str | None,
+        typer.Option(
+            metavar="F", help="Stream to Rerun: a file F.rrd, rerun+http://HOST:PORT/proxy, or spawn."
+        ),
+    ] = None,
     out: Annotated[Path | None, typer.Option(metavar="DIR", help="Default: runs/NAME of the input.")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print the summary as JSON.")] = False,
 ) -> None:
@@ -52,6 +60,7 @@ def command(
     from ..lab.picture import PICTURE, draw
     from ..lab.report import REPORT, write_report
     from ..lab.report.subject import Subject
+    from ..lab.viewer import Viewer
 
     if final == "batch" and estimator != "isam2":
         raise BadConfig("--final batch: a filter has no batch solution; leave it out, or --estimator")
@@ -61,10 +70,13 @@ def command(
         inputs, load_config(config) if config else None, settings or (), final, ESTIMATORS[estimator]
     )
     history = History(run)
-    _watch(run, history)
+    viewer = Viewer(run, rerun) if rerun else None
+    _watch(run, [history.see, *([viewer.see] if viewer else [])])
     write_run(run.result, target)
     history.write(target / NAME)
     draw(run.result, target / PICTURE)
+    if viewer:
+        viewer.finish()
     if report:
         write_report(Subject(target), target / REPORT)
     if as_json:
@@ -73,11 +85,12 @@ def command(
         _report(run, target)
 
 
-def _watch(run: "Run", history: "History") -> None:
+def _watch(run: "Run", watchers: "Sequence[Callable[[Update], None]]") -> None:
     with progress("replay", run.inputs.count) as advance:
         shown = 0
         for update in run:
-            history.see(update)
+            for see in watchers:
+                see(update)
             advance(run.inputs.read - shown)
             shown = run.inputs.read
         advance(run.inputs.count - shown)
