@@ -1,5 +1,6 @@
 # demo   a real log to a picture       test      quick proofs      test-all  and the long ones
 # lint   style and types               bench     measurements      docs      generated pages      clean
+# figures   those of the README, from real data
 # tf     tf2_msgs, which the ROS wheels lack
 
 # The tests speak over real DDS: with the ROS wheels, which exist for x86-64 Linux, unless a ROS install has been sourced.
@@ -15,7 +16,7 @@ BIN    := .venv/bin
 BAG    := demo/victoria_park.mcap
 RUN    := demo/run
 
-.PHONY: demo venv tf test test-all lint bench docs clean
+.PHONY: demo figures venv tf test test-all lint bench docs clean
 .DELETE_ON_ERROR:
 
 demo: .venv/.stamp-base
@@ -24,6 +25,9 @@ demo: .venv/.stamp-base
 	$(BIN)/slam-backend dataset victoria_park --out $(BAG)
 	$(BIN)/slam-backend replay $(BAG) --config config/victoria_park.yaml --out $(RUN)
 	@echo "open $$(ls $(RUN)/*.png): odometry alone, and the smoothed path with its landmarks"
+
+figures: demo
+	cp $(RUN)/trajectory.png docs/victoria_park.png
 
 venv: .venv/.stamp-$(EXTRAS)
 
