@@ -1,6 +1,6 @@
 """The way of a change: into the solver, whole; without what cannot be solved; with the parts that it connects."""
 
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -92,16 +92,8 @@ class Applier:
     def _moved(self, part: int, event: Factor) -> dict[int, Any]:
         """The variables of a part, moved as a whole so that the event's error is zero."""
         assert self.estimate is not None
-        pose = self.estimate.pose
-        shift: Pose
-        if event.kind == "pose":
-            shift = event.factor.prior().compose(pose(event.keys[0]).inverse())
-        else:
-            a, b = event.keys
-            there = pose(a).compose(event.factor.measured())
-            shift = there.compose(pose(b).inverse())
-            if self._parts.of(b) != part:
-                shift = shift.inverse()
+        poses = [self.estimate.pose(key) for key in event.keys]
+        shift = shift_of(event, poses, last=self._parts.of(event.keys[-1]) == part)
         values, space = self.estimate.values(), self._space
         return {
             key: shift.compose(space.pose_in(values, key))
@@ -109,6 +101,19 @@ class Applier:
             else shift.transformFrom(space.point_in(values, key))
             for key in self._parts.members(part)
         }
+
+    def replace(
+        self, estimate: Estimate, parts: Parts, added: Sequence[Factor], removed: Sequence[str]
+    ) -> None:
+        """The graph has been put together anew, and solved."""
+        joined = len(parts) < len(self._parts)
+        keys = {key for factor in added for key in factor.keys if self._parts.of(key) is None}
+        self.estimate = estimate
+        self._parts.become(parts)
+        self._booked(Delta(remove=tuple(removed)))
+        self._booked(Delta(tuple(factor for factor in added if factor.kind == "loop")))
+        for key in (*sorted(keys), *[UNTIL_JOINED][:joined]):
+            self._wake(key)
 
     def _solve(self, delta: Delta) -> bool:
         """Whether the change was applied whole; factors that cannot be solved are left out with a decision."""
@@ -151,6 +156,17 @@ class Applier:
         return np.asarray(
             (self.estimate.pose(pose_key) if pose is None else pose).transformTo(delta.values[key])
         )
+
+
+def shift_of(event: Factor, poses: Sequence[Pose], last: bool) -> Pose:
+    """By which a part is moved as a whole, so that the error of a factor between poses, or about one, is zero.
+
+    poses: those of the factor. last: the part is that of the last of them.
+    """
+    if event.kind == "pose":
+        return event.factor.prior().compose(poses[0].inverse())
+    shift = poses[0].compose(event.factor.measured()).compose(poses[1].inverse())
+    return shift if last else shift.inverse()
 
 
 def without(delta: Delta, ids: Collection[str]) -> Delta:

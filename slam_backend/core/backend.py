@@ -7,6 +7,7 @@ from typing import Any
 
 import gtsam
 import numpy as np
+from gtsam import symbolIndex
 
 from .adopted import Adopted
 from .apply import Applier, touched, without
@@ -101,7 +102,9 @@ class Backend:
         self._newest: tuple[Keyframe, Pose] | None = None  # and its odometry pose
         book = paths.book if self._robust else lambda _: None
         self._applier = Applier(self.solver, space, self.parts, self._waiting.wake, book)
-        self._editor = Editor(self.solver, space, self._applier)
+        self._editor = Editor(
+            self.solver, space, self._applier, lambda key: self.timeline.keyframes[symbolIndex(key)].stamp
+        )
         self._revision = 0
 
     def add(self, measurement: Measurement) -> list[Update]:
@@ -288,19 +291,26 @@ class Backend:
 
     def _carry_out(self, command: Command) -> list[Update]:
         """What a person asks; what came of it is a decision, told with the newest keyframe."""
+        self._editor.note(self._decisions)
         newest = self._newest[0] if self._newest else None
         decision = Decision(
             newest.stamp if newest else 0, f"command/{command.id}", command.source,
             "accepted", "command", command.action,
         )  # fmt: skip
         try:
-            outcome = self._editor.carry_out(command)
-            self._revision += outcome.revised
-            decision = replace(decision, basis={**outcome.told, "revision": self._revision})
+            plan, decisions = self._editor.carry_out(command)
+            self._revision += plan.revised
+            self._decisions += decisions
+            decision = replace(decision, basis={**plan.told, "revision": self._revision})
         except SlamError as error:
             decision = replace(decision, verdict="refused", detail=str(error))
         self._decisions.append(decision)
         return [self._told(newest)] if newest else []
+
+    def dry_run(self, action: str, arguments: Mapping[str, Any]) -> Mapping[str, Any]:
+        """What a command would come to; nothing is touched. SlamError where it would be refused."""
+        self._editor.note(self._decisions)
+        return {**self._editor.plan(action, arguments).told, "revision": self._revision}
 
     # -- the way of a change ---------------------------------------------------------------------
 
@@ -322,6 +332,7 @@ class Backend:
         return [self._told(b, delta.values.get(b.pose))] if self.timeline.at(b.stamp) is b else []
 
     def _judge(self, proposed: Delta) -> None:
+        self._editor.offered(proposed.add)
         self._admit(proposed, self._robust)
         for stage in self._robust:
             amendment, decisions = stage.review(self.estimate)
@@ -347,6 +358,8 @@ class Backend:
                     passed[each.id] = told
                 else:
                     self._decisions.append(told)
+        proposed, overruled = self._editor.respected(proposed, passed)
+        self._decisions += overruled
         self._applier.apply(touched(proposed), passed)
         self._decisions += self._applier.take_decisions()  # in the order in which they were made
 
@@ -373,4 +386,5 @@ class Backend:
         correction = pose.compose(self.track.pose(b.stamp).inverse())
         decisions = (*self._decisions, *self._applier.take_decisions())
         self._decisions = []
+        self._editor.note(decisions)
         return Update(b, self.space.seven(pose), self.space.seven(correction), self._revision, decisions)

@@ -1,20 +1,29 @@
-"""What a person asks of the graph, done between two measurements; ACTIONS is the list of it."""
+"""What a person asks of the graph, done between two measurements; ACTIONS is the list of it.
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+An action makes a plan and touches nothing: the graph put together anew, solved to its optimum, and what that would come to.
+To carry it out is to start the solver from there; a dry run leaves it at the plan.
+"""
+
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import gtsam
 
 from .apply import Applier
+from .assembly import Assembly, assembled
 from .command import Command
+from .edits import Wishes, edit_of, weighted
 from .errors import SlamError
-from .graph import is_pose
+from .graph import Decision, Delta, Factor, Verdict, is_pose
 from .solvers import Solver
-from .solvers.batch import polish
+from .solvers.batch import Solution, polish, solve
+from .solvers.descent import Options
+from .solvers.initialize import cost_of
 from .space import Space
 
 NOTICEABLE = (1e-3, 1e-4)  # m, rad: a correction of a pose that counts as a revision
+OUT = frozenset({"probation", "refused", "removed"})  # verdicts that keep a factor out
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,9 +39,22 @@ class Shift:
 
 
 @dataclass(frozen=True, slots=True)
-class Outcome:
-    """told: plain data for whoever asked. revised: poses that are published have changed."""
+class History:
+    """What is wished now; what was before, the newest last; what has been undone."""
 
+    now: Wishes = field(default_factory=Wishes)
+    past: tuple[Wishes, ...] = ()
+    undone: tuple[Wishes, ...] = ()
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Plan:
+    """reason: of the decisions about single factors. told: plain data for whoever asked. revised: poses that are published change."""
+
+    history: History
+    graph: Assembly
+    solution: Solution
+    reason: str
     told: Mapping[str, Any]
     revised: bool
 
@@ -40,40 +62,169 @@ class Outcome:
 class Editor:
     """Acts on the graph as a whole. What it cannot do is a SlamError, and has changed nothing."""
 
-    def __init__(self, solver: Solver, space: Space, applier: Applier) -> None:
+    def __init__(
+        self, solver: Solver, space: Space, applier: Applier, stamp_of: Callable[[int], int]
+    ) -> None:
+        """stamp_of: of a keyframe, by the key of its pose."""
         self._solver, self._space, self._applier = solver, space, applier
+        self._stamp_of = stamp_of
+        self._history = History()
+        self._known: dict[
+            str, Factor
+        ] = {}  # as they were made: what stages judge, and what a person has edited
+        self._said: dict[str, Verdict] = {}  # of those: the last verdict that was not a person's
 
-    def carry_out(self, command: Command) -> Outcome:
-        action = ACTIONS.get(command.action)
-        if action is None:
-            raise SlamError(f"there is no action '{command.action}'; known: {', '.join(ACTIONS)}")
+    # -- what a person asks ----------------------------------------------------------------------
+
+    def plan(self, action: str, arguments: Mapping[str, Any]) -> Plan:
+        """What it would come to."""
+        if action not in ACTIONS:
+            raise SlamError(f"there is no action '{action}'; known: {', '.join(ACTIONS)}")
         if self._applier.estimate is None:
             raise SlamError("there is no keyframe yet")
-        return action(self, command.arguments)
+        return ACTIONS[action](self, arguments)
 
-    def optimize(self, arguments: Mapping[str, Any]) -> Outcome:  # noqa: ARG002  # one signature for the table
+    def carry_out(self, command: Command) -> tuple[Plan, list[Decision]]:
+        """And the decisions about the factors that it is about."""
+        plan = self.plan(command.action, command.arguments)
+        before, held = self._history.now, dict(self._solver.factors)
+        estimate = self._solver.restart(plan.graph.factors, plan.solution.values)
+        for id_ in plan.history.now.ids - self._known.keys():
+            self._known[id_] = held[id_]
+        self._history = plan.history
+        now = self._solver.factors
+        added = [factor for id_, factor in now.items() if held.get(id_) is not factor]
+        removed = [id_ for id_, factor in held.items() if now.get(id_) is not factor]
+        self._applier.replace(estimate, plan.graph.parts, added, removed)
+        changed = sorted(_changed(before, plan.history.now))
+        return plan, [self._decision(self._known[id_], plan.reason, command) for id_ in changed]
+
+    def optimize(self, arguments: Mapping[str, Any]) -> Plan:  # noqa: ARG002  # one signature for the table
         """The optimum of the kept factors; the solver goes on from there, linearized anew."""
+        return self._planned(self._history, "optimized")
+
+    def edit(self, arguments: Mapping[str, Any]) -> Plan:
+        """Single factors disabled, enabled, removed or reweighted: all, or none."""
+        past = self._history
+        wishes = edit_of(arguments).applied(past.now, self._nameable())
+        return self._planned(History(wishes, (*past.past, past.now)), "edited")
+
+    def undo(self, arguments: Mapping[str, Any]) -> Plan:  # noqa: ARG002
+        """The last edit taken back. What came since, and what others decided, stays."""
+        past = self._history
+        if not past.past:
+            raise SlamError("there is no edit to undo")
+        return self._planned(History(past.past[-1], past.past[:-1], (*past.undone, past.now)), "undone")
+
+    def redo(self, arguments: Mapping[str, Any]) -> Plan:  # noqa: ARG002
+        past = self._history
+        if not past.undone:
+            raise SlamError("nothing has been undone")
+        return self._planned(History(past.undone[-1], (*past.past, past.now), past.undone[:-1]), "redone")
+
+    # -- what others decide ----------------------------------------------------------------------
+
+    def offered(self, factors: Iterable[Factor]) -> None:
+        """Stages are about to judge these: a person may overrule what they say."""
+        self._known.update((factor.id, factor) for factor in factors)
+
+    def note(self, decisions: Iterable[Decision]) -> None:
+        """What others decided about factors counts again where a person's wish is taken back."""
+        for each in decisions:
+            if each.id in self._known and each.stage != "edit":
+                self._said[each.id] = each.verdict
+
+    def respected(self, delta: Delta, passed: Mapping[str, Decision]) -> tuple[Delta, list[Decision]]:
+        """The change that stages want, without what a person has decided otherwise; and the decisions that say so.
+
+        passed: by id, why a factor may enter, told where it does not either.
+        """
+        wishes, held = self._history.now, self._solver.factors
+        overruled = {f.id: f for f in delta.add if f.id in wishes.out or f.id in held}
+        stays = [id_ for id_ in delta.remove if id_ in wishes.forced or id_ not in held]
+        decisions = []
+        for id_, factor in overruled.items():
+            self._said[id_] = "accepted"
+            decisions += [passed[id_]] if id_ in passed else []
+            decisions.append(self._decision(factor, "edited"))
+        for id_ in stays:
+            self._said[id_] = "removed"
+            if id_ in self._known:
+                decisions.append(self._decision(self._known[id_], "edited"))
+        add = tuple(weighted(f, wishes.weights.get(f.id, 1.0)) for f in delta.add if f.id not in overruled)
+        remove = tuple(id_ for id_ in delta.remove if id_ not in stays)
+        return replace(delta, add=add, remove=remove), decisions
+
+    # -- how -------------------------------------------------------------------------------------
+
+    def _nameable(self) -> list[Factor]:
+        held = self._solver.factors
+        others = [factor for id_, factor in self._known.items() if id_ not in held]
+        return [factor for factor in (*held.values(), *others) if factor.kind != "gauge"]
+
+    def _planned(self, history: History, reason: str) -> Plan:
         assert self._applier.estimate is not None
-        factors = list(self._solver.factors.values())
-        before = self._applier.estimate.values()
-        found = polish(factors, before)
-        self._applier.estimate = self._solver.restart(factors, found.values)
-        shift = self._shift(before, self._applier.estimate.values())
+        held, before = self._solver.factors, self._applier.estimate.values()
+        wishes = history.now
+        edited = wishes.ids | self._history.now.ids
+        kept = [factor for factor in held.values() if factor.kind != "gauge" and factor.id not in edited]
+        fresh: list[Factor] = []
+        for id_ in sorted(edited):
+            original = self._known.get(id_) or held[id_]
+            if self._enters(id_, wishes):
+                (kept if id_ in held else fresh).append(weighted(original, wishes.weights.get(id_, 1.0)))
+        gauges = [factor for factor in held.values() if factor.kind == "gauge"]
+        graph = assembled(self._space, kept, fresh, gauges, before, self._applier.sighted, self._stamp_of)
+        near = reason == "optimized"
+        solution = (
+            polish(graph.factors, graph.values)
+            if near
+            else solve(graph.factors, graph.values, Options(polish=True))
+        )
+        shift = self._shift(before, solution.values)
+        cost = {"before": cost_of(list(held.values()), before), "after": solution.cost}
         told = {
-            "cost": {"before": found.cost_initial, "after": found.cost},
-            "iterations": len(found.iterations),
-            "stop": found.stop,
+            "cost": cost | {"change": cost["after"] - cost["before"]},
             "largest_shift": {"m": shift.meters, "rad": shift.radians},
+            "iterations": len(solution.iterations),
+            "stop": solution.stop,
+            "parts": len(graph.parts),
         }
-        return Outcome(told, shift.noticeable)
+        if not near:
+            told["factors"] = sorted(_changed(self._history.now, wishes))
+        return Plan(history, graph, solution, reason, told, shift.noticeable if near else True)
+
+    def _enters(self, id_: str, wishes: Wishes) -> bool:
+        return id_ not in wishes.out and (id_ in wishes.forced or self._said.get(id_) not in OUT)
+
+    def _decision(self, factor: Factor, reason: str, command: Command | None = None) -> Decision:
+        """What holds for a factor by what a person wishes, or, where that has been taken back, by what others said last."""
+        out, forced, weight = self._history.now.of(factor.id)
+        verdict: Verdict = "removed" if out else "restored"
+        if not out and not forced:
+            said = self._said.get(factor.id, "restored")
+            verdict = said if said in OUT else "restored"
+        why = out or ("forced" if forced else "reweighted" if weight != 1.0 else reason)
+        return Decision(
+            factor.stamp, factor.id, factor.source, verdict, "edit", why,
+            f"by command {command.id}" if command else "by an earlier command, whatever others say",
+            statistic=weight if weight != 1.0 else None, ends=factor.stamps,
+        )  # fmt: skip
 
     def _shift(self, before: gtsam.Values, after: gtsam.Values) -> Shift:
-        keys = [key for key in before.keys() if is_pose(key) and after.exists(key)]  # noqa: SIM118  # no mapping
+        keys = [key for key in before.keys() if is_pose(key)]  # noqa: SIM118  # no mapping
         pose_in, size = self._space.pose_in, self._space.size
         sizes = [size(pose_in(before, key).between(pose_in(after, key))) for key in keys]
         return Shift(max((m for m, _ in sizes), default=0.0), max((r for _, r in sizes), default=0.0))
 
 
-ACTIONS: Mapping[str, Callable[[Editor, Mapping[str, Any]], Outcome]] = {
+def _changed(one: Wishes, other: Wishes) -> set[str]:
+    return {id_ for id_ in one.ids | other.ids if one.of(id_) != other.of(id_)}
+
+
+ACTIONS: Mapping[str, Callable[[Editor, Mapping[str, Any]], Plan]] = {
     "optimize": Editor.optimize,
+    "edit": Editor.edit,
+    "undo": Editor.undo,
+    "redo": Editor.redo,
 }

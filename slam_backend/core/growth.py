@@ -17,6 +17,13 @@ from .waiting import refusal
 GAUGE_SIGMA = 1e-3  # m and rad; of the prior that fixes a part of the graph in space
 
 
+def gauge(space: Space, key: int, stamp: int, pose: Pose) -> Factor:
+    """Holds a part of the graph where this pose of it is."""
+    noise = noise_of(space.diagonal(GAUGE_SIGMA**2, GAUGE_SIGMA**2))
+    name = f"gauge/{format_stamp(stamp)}/0"
+    return Factor(name, "gauge", space.prior(key, pose, noise), (key,), stamp)
+
+
 class Growth:
     """Books new keyframes in the timeline, the parts and, where edges are the odometry, the track."""
 
@@ -25,11 +32,9 @@ class Growth:
 
     def start(self, stamp: int) -> tuple[Keyframe, Delta]:
         """A part of its own: its first pose is the origin, until something absolute says otherwise."""
-        first = self._added(stamp)
-        name = f"gauge/{format_stamp(stamp)}/0"
-        self._parts.begin(first.pose, name)
-        origin, noise = self._space.identity, noise_of(self._space.diagonal(GAUGE_SIGMA**2, GAUGE_SIGMA**2))
-        factor = Factor(name, "gauge", self._space.prior(first.pose, origin, noise), (first.pose,), stamp)
+        first, origin = self._added(stamp), self._space.identity
+        factor = gauge(self._space, first.pose, stamp, origin)
+        self._parts.begin(first.pose, factor.id)
         return first, Delta((factor,), values={first.pose: origin})
 
     def follow(self, a: Keyframe, stamp: int) -> Keyframe:

@@ -12,6 +12,10 @@ class Parts:
     def __len__(self) -> int:
         return len(self._members)
 
+    @property
+    def numbers(self) -> list[int]:
+        return list(self._members)
+
     def of(self, key: int) -> int | None:
         """The part that a variable belongs to; None when it is not in the graph."""
         return self._of.get(key)
@@ -43,9 +47,17 @@ class Parts:
             del self._members[part]
             self._gauges.pop(part, None)
 
+    def hold(self, part: int, gauge: str) -> None:
+        """The part has this gauge now."""
+        self._gauges[part] = gauge
+
     def release(self, part: int) -> None:
         """The part's gauge has been removed."""
         self._gauges.pop(part, None)
+
+    def become(self, other: "Parts") -> None:
+        """The parts of a graph that has been put together anew."""
+        vars(self).update(vars(other))
 
     def merge(self, kept: int, gone: int) -> None:
         for key in self._members[gone]:

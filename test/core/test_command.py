@@ -6,39 +6,13 @@ import pytest
 from slam_backend.core.backend import Backend
 from slam_backend.core.command import command, parse, text_of
 from slam_backend.core.errors import BadMessage
-from slam_backend.core.graph import Decision
 from slam_backend.core.measurement import SECOND, Measurement
-from slam_backend.core.sensors.odometry import STILL, UNKNOWN, OdometryPose
-from slam_backend.core.sensors.relative import RelativePose
 from slam_backend.core.settle import settled
 
-SIDE = 8  # keyframes of each side of a square
 
-
-def seven(x, y, yaw):
-    return np.array([x, y, 0, 0, 0, np.sin(yaw / 2), np.cos(yaw / 2)])
-
-
-def drive(laps=2, drift=0.02):
-    """Around a square, the odometry turning a little too far; a loop at each corner after the first lap."""
-    pose, heading, seen = np.zeros(2), 0.0, {}
-    for n in range(laps * 4 * SIDE):
-        stamp = (n + 1) * SECOND
-        yield OdometryPose(stamp, "odometry", "odom", "base", seven(*pose, heading), UNKNOWN, STILL, UNKNOWN)
-        place = n % (4 * SIDE)
-        if place in seen and place % SIDE == 0:
-            same = seven(0, 0, 0)
-            yield RelativePose(stamp, "relative", seen[place], stamp, "base", "base", same, np.zeros(36))
-        seen.setdefault(place, stamp)
-        pose = pose + np.array([np.cos(heading), np.sin(heading)])
-        heading += (np.pi / 2 if n % SIDE == SIDE - 1 else 0) + drift
-
-
-def driven(until=None):
+def driven(items):
     backend = Backend()
-    for n, item in enumerate(drive()):
-        if n == until:
-            break
+    for item in items:
         backend.add(item)
     return backend
 
@@ -75,8 +49,8 @@ def test_a_command_keeps_its_place_of_arrival():
     assert out[1] is asked
 
 
-def test_an_optimization_ends_at_the_optimum_and_says_what_it_did():
-    backend = driven()
+def test_an_optimization_ends_at_the_optimum_and_says_what_it_did(laps):
+    backend = driven(laps)
     before = backend.snapshot().trajectory.sevens
     updates = backend.add(command("1", "optimize", {}))
     decision = updates[-1].decisions[-1]
@@ -91,27 +65,21 @@ def test_an_optimization_ends_at_the_optimum_and_says_what_it_did():
     assert again["revision"] == told["revision"] == updates[-1].revision
 
 
-def test_the_drive_goes_on_from_the_optimum():
-    """What comes after a command is solved from its outcome: the same graph, and another estimate than without it."""
-    with_, without = driven(), Backend()
-    for n, item in enumerate(drive()):
-        without.add(item)
-        if n == 50:
-            online = without.estimate.pose(without.timeline.newest.pose)
-    half = driven(until=51)
+def test_the_drive_goes_on_from_the_optimum(laps):
+    """What comes after a command is solved from its outcome: another estimate than without it, the same graph."""
+    half, without = driven(laps[:50]), driven(laps[:50])
     half.add(command("1", "optimize", {}))
-    assert not half.estimate.pose(half.timeline.newest.pose).equals(online, 1e-12)
-    for n, item in enumerate(drive()):
-        if n > 50:
-            half.add(item)
-    assert half.solver.factors.keys() == with_.solver.factors.keys()
+    newest = half.timeline.newest.pose
+    assert not half.estimate.pose(newest).equals(without.estimate.pose(newest), 1e-12)
     for backend in (half, without):
-        backend.add(command("end", "optimize", {}))
+        for item in (*laps[50:], command("end", "optimize", {})):
+            backend.add(item)
+    assert half.solver.factors.keys() == without.solver.factors.keys()
     assert half.snapshot().trajectory.sevens == pytest.approx(without.snapshot().trajectory.sevens, abs=1e-6)
 
 
-def test_a_command_that_cannot_be_done_is_refused_and_changes_nothing():
-    backend = driven()
+def test_a_command_that_cannot_be_done_is_refused_and_changes_nothing(laps):
+    backend = driven(laps)
     before = backend.snapshot().trajectory.sevens
     decision = backend.add(command("1", "explode", {}))[-1].decisions[-1]
     assert (decision.verdict, decision.reason) == ("refused", "explode")
@@ -119,9 +87,9 @@ def test_a_command_that_cannot_be_done_is_refused_and_changes_nothing():
     assert np.array_equal(backend.snapshot().trajectory.sevens, before)
 
 
-def test_a_command_before_the_first_keyframe_is_refused_with_it():
+def test_a_command_before_the_first_keyframe_is_refused_with_it(laps):
     backend = Backend()
     assert backend.add(command("1", "optimize", {})) == []
-    first = next(update for item in drive() for update in backend.add(item))
-    decisions = [d for d in first.decisions if isinstance(d, Decision) and d.stage == "command"]
+    first = next(update for item in laps for update in backend.add(item))
+    decisions = [d for d in first.decisions if d.stage == "command"]
     assert [(d.id, d.verdict) for d in decisions] == [("command/1", "refused")]
