@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from ..core.backend import Update
+from ..core.command import parse
 from ..core.config import Config
 from ..core.errors import SlamError
 from ..core.graph import Decision, keyframe
@@ -28,7 +29,7 @@ from .replay import Result, Run
 from .rundir import write_run
 from .typestore import typestore_of
 
-RequestName = Literal["snapshot", "covariance", "save", "finish"]
+RequestName = Literal["snapshot", "covariance", "dry_run", "save", "finish"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,7 +49,8 @@ class Report:
 
 @dataclass(frozen=True, slots=True)
 class Request:
-    """snapshot: a Snapshot. covariance: of the pose of keyframe number `argument`, at its tangent. save: write a run
+    """snapshot: a Snapshot. covariance: of the pose of keyframe number `argument`, at its tangent. dry_run: what the command
+    `argument`, as JSON, would come to. save: write a run
     directory at `argument`. finish: the input has ended; save, and end.
     """
 
@@ -184,6 +186,9 @@ class _Worker:
             return self._run.backend.snapshot()
         if request.name == "covariance":
             return self._run.backend.estimate.covariance([keyframe(int(request.argument), 0).pose])
+        if request.name == "dry_run":
+            asked = parse(request.argument)
+            return self._run.backend.dry_run(asked.action, asked.arguments)
         result = Result(self._run)
         write_run(result, Path(request.argument))
         return result.summary

@@ -11,6 +11,7 @@ import threading
 from collections.abc import Awaitable, Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from datetime import UTC, datetime
+from functools import partial
 from inspect import isawaitable
 from itertools import count
 from pathlib import Path
@@ -26,14 +27,17 @@ from rclpy.node import Node
 from rclpy.task import Future
 from std_srvs.srv import SetBool, Trigger
 
+from ..core.command import command, text_of
 from ..core.config import Config
 from ..core.errors import BadConfig, BadFile, SlamError
+from ..core.graph import Decision
 from ..core.measurement import Array, format_stamp
 from ..core.query import answers
 from ..core.trajectory import Snapshot
 from ..io.feeder import Feeder
 from .answers import Answers
 from .believed import Believed
+from .editing import edit_in
 from .session import Session
 from .state import State
 
@@ -80,9 +84,10 @@ class Services:
             "load": (LoadMap, self._load),
             "pause": (SetBool, self._pause),
             "save": (Trigger, _told(self._save)),
-            "optimize": (Trigger, _told(self._optimize)),
             "reset": (Trigger, _told(self._begin_anew)),
-        } | {name: (Trigger, _told(_not_yet)) for name in ("undo", "redo")}
+        } | {
+            name: (Trigger, _told(partial(self._command, name, {}))) for name in ("optimize", "undo", "redo")
+        }
         self._services = [
             node.create_service(type_, f"~/{name}", self._survived(callback), callback_group=group)
             for name, (type_, callback) in table.items()
@@ -197,18 +202,23 @@ class Services:
         counts = {name: summary["counts"][name] for name in ("keyframes", "landmarks", "factors")}
         return {"run": str(run), "run_hash": summary["run_hash"], **counts}
 
-    async def _optimize(self) -> Content:
-        return await self._command("optimize", {})
-
     async def _command(self, action: str, arguments: Mapping[str, Any]) -> Content:
         """What came of a command that went by way of the journal. SlamError says why it was not carried out."""
         session = self._session_of()
         if session is None:
             raise SlamError(NO_SESSION)
-        decision = await self._elsewhere(lambda: session.command(action, arguments, ACTING))
+        decision = await self._elsewhere(lambda: self._carried_out(session, action, arguments))
         if decision.verdict != "accepted":
             raise SlamError(decision.detail)
         return decision.basis
+
+    def _carried_out(self, session: Session, action: str, arguments: Mapping[str, Any]) -> Decision:
+        """And what is asked from now on is answered from the map as it is by then."""
+        decision = session.command(action, arguments, ACTING)
+        if session.feeder is not None:
+            with suppress(SlamError):
+                self._state.show(session.feeder.request("snapshot", timeout=ACTING))
+        return decision
 
     async def _begin_anew(self) -> Content:
         if not self._resetting.acquire(blocking=False):
@@ -229,10 +239,25 @@ class Services:
         response.message = json.dumps({"paused": request.data, "backlog": feeder.backlog if feeder else 0})
         return response
 
-    def _edit(self, _: Any, response: SetParametersAtomically.Response) -> Any:
-        response.result.successful = False
-        response.result.reason = json.dumps({"error": NOT_YET})
+    async def _edit(
+        self, request: SetParametersAtomically.Request, response: SetParametersAtomically.Response
+    ) -> Any:
+        """All or nothing. A dry run asks the worker, and leaves the journal alone."""
+        try:
+            arguments, dry = edit_in(request.parameters)
+            answer = await (self._tried(arguments) if dry else self._command("edit", arguments))
+            response.result.reason, response.result.successful = json.dumps(answer), True
+        except SlamError as error:
+            response.result.reason = json.dumps({"error": str(error)})
         return response
+
+    async def _tried(self, arguments: Mapping[str, Any]) -> Content:
+        feeder = self._feeder_of()
+        if feeder is None:
+            raise SlamError(NO_SESSION)
+        asked = text_of(command("dry run", "edit", arguments))
+        told: Content = await self._elsewhere(lambda: feeder.request("dry_run", asked, ACTING))
+        return told
 
     def _load(self, request: LoadMap.Request, response: LoadMap.Response) -> Any:
         self._node.get_logger().warning(f"load of '{request.map_url}' refused: {NOT_YET}")
@@ -292,10 +317,6 @@ def _told(
         return response
 
     return callback
-
-
-async def _not_yet() -> Content:
-    raise SlamError(NOT_YET)
 
 
 def _names(path: Path) -> Iterator[Path]:

@@ -19,7 +19,7 @@ pytest.importorskip("rclpy")
 
 import rclpy
 from nav_msgs.srv import GetPlan, LoadMap
-from rcl_interfaces.msg import ParameterType
+from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
 from rcl_interfaces.srv import GetParameters, ListParameters, SetParametersAtomically
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from std_srvs.srv import SetBool, Trigger
@@ -183,6 +183,22 @@ class Client:
     def trigger(self, name: str) -> tuple[bool, Any]:
         return told(self.end(self.begin(name, Trigger.Request(), Trigger)))
 
+    def edit(self, **given: Any) -> tuple[bool, Any]:
+        """Lists of names, a name, or a bool by the name of a parameter."""
+        request = SetParametersAtomically.Request()
+        for name, value in given.items():
+            parameter = Parameter(name=name)
+            if isinstance(value, bool):
+                parameter.value = ParameterValue(type=ParameterType.PARAMETER_BOOL, bool_value=value)
+            elif isinstance(value, str):
+                parameter.value = ParameterValue(type=ParameterType.PARAMETER_STRING, string_value=value)
+            else:
+                type_ = ParameterType.PARAMETER_STRING_ARRAY
+                parameter.value = ParameterValue(type=type_, string_array_value=value)
+            request.parameters.append(parameter)
+        result = self.end(self.begin("edit", request, SetParametersAtomically)).result
+        return result.successful, json.loads(result.reason)
+
     def pause(self, on: bool) -> tuple[bool, Any]:
         return told(self.end(self.begin("pause", SetBool.Request(data=on), SetBool)))
 
@@ -343,14 +359,7 @@ def test_a_covariance_comes_from_the_worker(warehouse) -> None:
     assert (np.diag(covariance)[[0, 1, 5]] > 0).all()
 
 
-@pytest.mark.parametrize("name", ["undo", "redo"])
-def test_what_does_not_exist_yet_says_so(warehouse, name) -> None:
-    assert warehouse.trigger(name) == (False, {"error": "not available yet"})
-
-
-def test_an_edit_and_a_map_to_load_are_refused(warehouse) -> None:
-    request = SetParametersAtomically.Request()
-    assert not warehouse.end(warehouse.begin("edit", request, SetParametersAtomically)).result.successful
+def test_a_map_to_load_is_refused(warehouse) -> None:
     request = LoadMap.Request(map_url="/etc/passwd")
     refused = LoadMap.Response.RESULT_UNDEFINED_FAILURE
     assert warehouse.end(warehouse.begin("load", request, LoadMap)).result == refused
@@ -371,6 +380,45 @@ def test_an_optimization_is_answered_and_decided(warehouse) -> None:
     assert again["revision"] == content["revision"]
     names = list(warehouse.listed("decisions/command").names)
     assert [decision["basis"] for decision in warehouse.query(*names)] == [content, again]
+
+
+def test_an_edit_is_tried_done_undone_and_redone(warehouse) -> None:
+    loops = [name.removeprefix("decision/") for name in warehouse.listed("loops").names][:3]
+    warehouse.trigger("optimize")
+    before = warehouse.query("pose@now")[0]
+    tried, would = warehouse.edit(disable=loops, dry_run=True)
+    assert tried, would
+    assert np.array_equal(warehouse.query("pose@now")[0], before)
+    done, content = warehouse.edit(disable=loops)
+    assert done
+    assert content["cost"] == would["cost"]
+    assert content["largest_shift"] == would["largest_shift"]
+    assert content["revision"] == would["revision"] + 1
+    verdict = warehouse.query(f"decision/{loops[0]}")[0]
+    assert (verdict["verdict"], verdict["stage"], verdict["reason"]) == ("removed", "edit", "disabled")
+    assert warehouse.trigger("undo")[0]
+    assert warehouse.query(f"decision/{loops[0]}")[0]["verdict"] == "restored"
+    assert warehouse.query("pose@now")[0] == pytest.approx(before, abs=1e-6)
+    assert warehouse.trigger("redo")[0]
+    assert warehouse.trigger("undo")[0]
+    assert warehouse.trigger("undo")[1] == {"error": "there is no edit to undo"}
+
+
+@pytest.mark.parametrize(
+    ("given", "why"),
+    [
+        ({}, "nothing to edit"),
+        ({"disable": "loops/17.0/0"}, "no factor 'loops/17.0/0'"),
+        ({"explode": "loops"}, "parameter 'explode'"),
+        ({"disable": True}, "no string"),
+        ({"reweight": "loops"}, "NAME=FACTOR"),
+        ({"enable": "nobody", "dry_run": True}, "no factors of 'nobody'"),
+    ],
+)
+def test_an_edit_that_cannot_be_says_why(warehouse, given, why) -> None:
+    done, content = warehouse.edit(**given)
+    assert not done
+    assert why in content["error"]
 
 
 def test_nothing_is_optimized_before_there_is_something(host) -> None:
