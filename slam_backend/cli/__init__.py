@@ -32,6 +32,7 @@ VERBS: Mapping[
     "query": "Poses at any stamp, covariances, landmarks, decisions of a finished run.",
     "evaluate": "How far a run is from the truth: ATE, RPE.",
     "diff": "What moved in the map between two moments, and what came between them.",
+    "compare": "What differs between runs, with an exit code for scripts.",
 }
 
 TRACEBACK = "SLAM_BACKEND_TRACEBACK"

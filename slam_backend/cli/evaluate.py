@@ -2,7 +2,7 @@
 
 import json
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
@@ -65,16 +65,19 @@ def _aligned(align: str) -> str:
 
 def _table(found: "dict[str, Errors]") -> list[str]:
     """A line for each trajectory."""
-    heads = ("", "poses", "ATE m", "ATE deg", "RPE m/m", "RPE deg/m", "ATE max m", "scale")
-    rows: list[tuple[Any, ...]] = [heads]
+    rows = [["", "poses", "ATE m", "ATE deg", "RPE m/m", "RPE deg/m", "ATE max m", "scale"]]
     for name, errors in found.items():
         numbers = [_shown(value) for value in errors.numbers().values()]
-        rows.append((name, errors.poses, *numbers, _shown(errors.ate["max"]), f"{errors.scale:.6g}"))
-    widths = [max(len(str(row[k])) for row in rows) for k in range(len(heads))]
+        rows.append([name, str(errors.poses), *numbers, _shown(errors.ate["max"]), f"{errors.scale:.6g}"])
+    return columns(rows)
+
+
+def columns(rows: list[list[str]]) -> list[str]:
+    """Rows of equally many cells as lines, set right but for the first column."""
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     return [
         "  ".join(
-            str(cell).ljust(w) if k == 0 else str(cell).rjust(w)
-            for k, (cell, w) in enumerate(zip(row, widths, strict=True))
+            [row[0].ljust(widths[0]), *(cell.rjust(w) for cell, w in zip(row[1:], widths[1:], strict=True))]
         )
         for row in rows
     ]

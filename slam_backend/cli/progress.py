@@ -2,9 +2,10 @@
 
 import sys
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 
 Advance = Callable[[int], None]
+Progress = Callable[[str, int | None], AbstractContextManager[Advance]]
 
 
 @contextmanager
@@ -15,6 +16,12 @@ def progress(what: str, total: int | None) -> Iterator[Advance]:
         return
     with _bar(what, total) as advance:
         yield advance
+
+
+@contextmanager
+def silent(_what: str, _total: int | None) -> Iterator[Advance]:
+    """For work that another bar counts."""
+    yield _nothing
 
 
 def _nothing(_: int) -> None:

@@ -2,19 +2,20 @@
 
 import json
 import sys
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from ..core.errors import BadConfig
-from .progress import progress
+from ..core.errors import BadConfig, SlamError
+from .progress import Progress, progress, silent
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
     from ..core.backend import Update
-    from ..io.replay import Run
+    from ..io.replay import Result, Run
 
 
 def command(
@@ -39,6 +40,12 @@ def command(
         Literal["isam2", "ekf"],
         typer.Option(help="isam2: the smoother; ekf: a filter over the same factors, to compare with."),
     ] = "isam2",
+    sweep: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="K=A,B,C", help="A run for each value of a setting; may be given several times."
+        ),
+    ] = None,
     report: Annotated[
         bool, typer.Option(help="Write report.html, the page that answers what people ask.")
     ] = True,
@@ -51,7 +58,42 @@ def command(
     out: Annotated[Path | None, typer.Option(metavar="DIR", help="Default: runs/NAME of the input.")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print the summary as JSON.")] = False,
 ) -> None:
-    """Replay recorded logs through the same core as the live node, and write a run directory."""
+    """Replay recorded logs through the same core as the live node, and write a run directory.
+
+    With --sweep a run directory for each combination of the values, and a comparison with the first of them.
+    """
+    if final == "batch" and estimator != "isam2":
+        raise BadConfig("--final batch: a filter has no batch solution; leave it out, or --estimator")
+    if sweep and rerun:
+        raise BadConfig("--rerun: shows one run; leave it out, or --sweep")
+    target = out or Path("runs") / inputs[0].stem
+    job = Job(tuple(inputs), config, tuple(settings or ()), final, estimator, report, rerun, target)
+    if sweep:
+        _sweep(job, sweep, as_json)
+        return
+    result = work(job, progress)
+    if as_json:
+        typer.echo(json.dumps(result.summary))
+    else:
+        _report(result.run, target)
+
+
+@dataclass(frozen=True)
+class Job:
+    """What one replay takes, in the words of the command line; plain data, for a process of its own."""
+
+    inputs: tuple[Path, ...]
+    config: Path | None
+    settings: tuple[str, ...]
+    final: Literal["none", "batch"]
+    estimator: str
+    report: bool
+    rerun: str | None
+    out: Path
+
+
+def work(job: Job, shown: "Progress") -> "Result":
+    """Replay, and write the run directory."""
     from ..io.configfile import load_config
     from ..io.history import NAME, History
     from ..io.replay import replay
@@ -62,38 +104,66 @@ def command(
     from ..lab.report.subject import Subject
     from ..lab.viewer import Viewer
 
-    if final == "batch" and estimator != "isam2":
-        raise BadConfig("--final batch: a filter has no batch solution; leave it out, or --estimator")
-    target = out or Path("runs") / inputs[0].stem
-    prepare(target)
-    run = replay(
-        inputs, load_config(config) if config else None, settings or (), final, ESTIMATORS[estimator]
-    )
+    prepare(job.out)
+    config = load_config(job.config) if job.config else None
+    run = replay(job.inputs, config, job.settings, job.final, ESTIMATORS[job.estimator])
     history = History(run)
-    viewer = Viewer(run, rerun) if rerun else None
-    _watch(run, [history.see, *([viewer.see] if viewer else [])])
-    write_run(run.result, target)
-    history.write(target / NAME)
-    draw(run.result, target / PICTURE)
+    viewer = Viewer(run, job.rerun) if job.rerun else None
+    _watch(run, [history.see, *([viewer.see] if viewer else [])], shown)
+    write_run(run.result, job.out)
+    history.write(job.out / NAME)
+    draw(run.result, job.out / PICTURE)
     if viewer:
         viewer.finish()
-    if report:
-        write_report(Subject(target), target / REPORT)
+    if job.report:
+        write_report(Subject(job.out), job.out / REPORT)
+    return run.result
+
+
+def aside(job: Job) -> str:
+    """`work` in a process of its own: what went wrong, in one line."""
+    try:
+        work(job, silent)
+    except (SlamError, OSError) as error:
+        return str(error)
+    return ""
+
+
+def _sweep(job: Job, sweeps: "Sequence[str]", as_json: bool) -> None:
+    """All combinations, then those that ended well beside the first of them."""
+    from ..io.rundir import FinishedRun, prepare
+    from ..lab.compare import compare
+    from ..lab.sweep import grid, in_processes
+    from .compare import as_plain, show
+
+    points = grid(sweeps)
+    jobs = [replace(job, settings=(*job.settings, *point), out=job.out / ",".join(point)) for point in points]
+    for each in jobs:
+        prepare(each.out)
+    with progress("sweep", len(jobs)) as advance:
+        failures = in_processes(aside, jobs, lambda: advance(1))
+    for each, failure in zip(jobs, failures, strict=True):
+        if failure:
+            sys.stderr.write(f"failed: {each.out.name}: {failure}\n")
+    done = [FinishedRun(each.out) for each, failure in zip(jobs, failures, strict=True) if not failure]
+    found = compare(done) if done else []
     if as_json:
-        typer.echo(json.dumps(run.result.summary))
-    else:
-        _report(run, target)
+        typer.echo(json.dumps([as_plain(each) for each in found]))
+    elif found:
+        show(found)
+    if len(done) < len(jobs):
+        raise typer.Exit(2)
 
 
-def _watch(run: "Run", watchers: "Sequence[Callable[[Update], None]]") -> None:
-    with progress("replay", run.inputs.count) as advance:
-        shown = 0
+def _watch(run: "Run", watchers: "Sequence[Callable[[Update], None]]", shown: "Progress") -> None:
+    with shown("replay", run.inputs.count) as advance:
+        told = 0
         for update in run:
             for see in watchers:
                 see(update)
-            advance(run.inputs.read - shown)
-            shown = run.inputs.read
-        advance(run.inputs.count - shown)
+            advance(run.inputs.read - told)
+            told = run.inputs.read
+        advance(run.inputs.count - told)
 
 
 def _report(run: "Run", target: Path) -> None:

@@ -68,3 +68,11 @@ def _nearby(path: Path) -> str:
     names = [p.name for p in path.parent.glob("*.y*ml")] if path.parent.is_dir() else []
     close = get_close_matches(path.name, names, n=1)
     return f"; did you mean '{path.parent / close[0]}'?" if close else ""
+
+
+def flat(tree: Mapping[str, Any], above: str = "") -> list[tuple[str, Any]]:
+    """`a.b.c` and the value, of every setting, as `--set` names them."""
+    found: list[tuple[str, Any]] = []
+    for name, value in tree.items():
+        found += flat(value, f"{above}{name}.") if isinstance(value, Mapping) else [(f"{above}{name}", value)]
+    return found

@@ -3,6 +3,7 @@
 from pathlib import Path
 
 from ...core.config import Config, config_to
+from ...io.configfile import flat
 from .page import Section, said, table
 from .subject import Subject
 
@@ -42,17 +43,5 @@ def section(run: Subject) -> Section:
 def _differences(config: Config) -> list[tuple[str, str]]:
     usual = config_to(Config())
     return [
-        (name, str(value))
-        for name, value in _flat(config_to(config))
-        if value != dict(_flat(usual)).get(name)
+        (name, str(value)) for name, value in flat(config_to(config)) if value != dict(flat(usual)).get(name)
     ]
-
-
-def _flat(tree: dict[str, object], above: str = "") -> list[tuple[str, object]]:
-    found: list[tuple[str, object]] = []
-    for name, value in tree.items():
-        if isinstance(value, dict):
-            found += _flat(value, f"{above}{name}.")
-        else:
-            found.append((f"{above}{name}", value))
-    return found
