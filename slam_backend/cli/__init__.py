@@ -29,6 +29,7 @@ VERBS: Mapping[
     "simulate": "A world with ground truth, as a bag.",
     "convert": "A pose graph or trajectory from one format to another.",
     "report": "A page that answers what people ask of a run.",
+    "doctor": "A recording as the firewall sees it: what each topic holds, and what to mend.",
     "query": "Poses at any stamp, covariances, landmarks, decisions of a finished run.",
     "evaluate": "How far a run is from the truth: ATE, RPE.",
     "diff": "What moved in the map between two moments, and what came between them.",

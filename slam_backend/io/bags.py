@@ -19,6 +19,7 @@ from rosbags.serde import SerdeError
 from rosbags.typesys.store import Typestore
 
 from ..core.errors import BadFile
+from .qos import offered_qos
 from .records import Record
 from .storage import open_storage
 from .storage.folder import Folder, open_file, read_folder
@@ -80,6 +81,12 @@ class Bag:
         types = {c.topic: c.type for c in reversed(readable)}
         return {name: Topic(types[name], counts[name]) for name in sorted(types)}
 
+    @cached_property
+    def qos(self) -> dict[str, str]:
+        """By topic: reliability and durability that its publishers offered, the weakest of each; only where the bag says."""
+        said = ((c.topic, offered_qos(c.qos)) for c in self._connections if c.qos)
+        return {topic: words for topic, words in said if words}
+
     @property
     def count(self) -> int:
         """Messages of all topics, for progress; a damaged bag may yield fewer."""
@@ -116,6 +123,13 @@ class Bag:
                 self._leave_out(topic, f"the type {error} is not defined")
                 continue
             yield Record(topic, connection.type, log_time, data)
+
+    def log_times(self, topics: Topics = None) -> Iterator[tuple[str, int]]:
+        """Topic and log time (ns) of each message, in order; nothing is understood of what they hold."""
+        for log_time, topic, *_ in _in_order(
+            [part for c in self._opened.contents for part in c.parts], topics
+        ):
+            yield topic, log_time
 
     def _leave_out(self, topic: str, why: str) -> None:
         count, first = self._lost.get(topic, (0, why))

@@ -1,9 +1,10 @@
 """What a run reads: bags, in order of arrival, or one pose graph, as if live."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from difflib import get_close_matches
 from heapq import merge
+from itertools import repeat
 from pathlib import Path
 from typing import Protocol, Self
 
@@ -18,6 +19,7 @@ from .bags import Bag, Topic, open_bag
 from .cdr import DECODERS, Decoder
 from .formats import FORMATS, read_graph
 from .formats.posegraph import PERIOD, PoseGraph, measurements
+from .records import Record
 
 EDGES, LANDMARKS = "edges", "landmarks"  # the sources of a graph file, when the configuration names none
 TF_STATIC = "/tf_static"
@@ -95,17 +97,26 @@ class BagInputs(_Closing):
             topic.count for name, topic in self.topics.items() if name in table and name != events.TOPIC
         )
         decoders = [Decoder(bag.typestore, table) for bag in self.bags]
-        streams = [bag.records(set(table)) for bag in self.bags]
-        if len(streams) == 1:
-            decode = decoders[0].decode
-            for record in streams[0]:
-                self.read += not events.is_own(record)
-                yield from decode(record)
-            return
-        tagged = [((record, n) for record in stream) for n, stream in enumerate(streams)]
-        for record, n in merge(*tagged, key=lambda pair: (pair[0].log_time, pair[0].topic)):
+        for record, n in self._records(set(table)):
             self.read += not events.is_own(record)
             yield from decoders[n].decode(record)
+
+    def _records(self, topics: Collection[str]) -> Iterator[tuple[Record, int]]:
+        """In order of log time, each with the number of its bag."""
+        tagged = [zip(bag.records(topics), repeat(n)) for n, bag in enumerate(self.bags)]
+        if len(tagged) == 1:
+            return tagged[0]
+        return merge(*tagged, key=lambda pair: (pair[0].log_time, pair[0].topic))
+
+    def log_times(self, topics: Collection[str]) -> Iterator[tuple[str, int]]:
+        """Topic and log time (ns) of each message, bag after bag, whatever the messages hold."""
+        for bag in self.bags:
+            yield from bag.log_times(topics)
+
+    @property
+    def qos(self) -> dict[str, str]:
+        """What the publishers of a topic offered, where a bag says it."""
+        return {name: words for bag in reversed(self.bags) for name, words in bag.qos.items()}
 
     def vertex(self, stamp: int) -> int | None:  # noqa: ARG002  # a bag has no vertices
         return None

@@ -8,6 +8,7 @@ from typing import Any
 from diagnostic_msgs.msg import DiagnosticArray
 
 from ..core.config import Config
+from ..core.firewall.rules import Severity, rule_of
 from ..io.encode import Status, encode_diagnostics
 from ..io.feeder import Feeder
 from ..io.inputs import TF_STATIC
@@ -16,6 +17,7 @@ from .inputs import Inputs
 from .state import State
 
 OK, WARN, ERROR = 0, 1, 2
+LEVELS: Mapping[Severity, int] = {"note": OK, "warn": WARN, "error": ERROR}
 SILENT = 3.0  # s without a message after which a source is silent
 FRESH = 10.0  # s for which an incident is the news
 BEHIND = 2000  # rows that the worker has yet to read, beyond which it is behind
@@ -24,6 +26,9 @@ BEHIND = 2000  # rows that the worker has yet to read, beyond which it is behind
 class Diagnostics:
     def __init__(self, node: Any, state: State) -> None:
         self._node, self._state = node, state
+        self._said: dict[
+            tuple[str, str], tuple[int, float]
+        ] = {}  # (source, rule) -> count, when it last grew
         self._publisher = node.create_publisher(DiagnosticArray, "/diagnostics", 10)
 
     def close(self) -> None:
@@ -43,8 +48,13 @@ class Diagnostics:
         self._publisher.publish(encode_diagnostics(stamp, statuses))
 
     def _source(self, source: str, topic: str, inputs: Inputs) -> tuple[int, str, dict[str, str]]:
-        refused = {rule: str(n) for (who, rule), n in self._state.refused.items() if who == source}
-        values = {"topic": topic, **refused}
+        told = {
+            rule: n
+            for counts in (self._state.noted, self._state.refused)
+            for (who, rule), n in list(counts.items())
+            if who == source
+        }
+        values = {"topic": topic, **{rule: str(n) for rule, n in told.items()}}
         if topic in inputs.unreadable:
             return ERROR, f"the topic has {inputs.unreadable[topic]}, which its kind cannot read", values
         flow = inputs.flows.get(topic)
@@ -60,7 +70,24 @@ class Diagnostics:
             return ERROR, "its publisher is gone", values
         if age is None or age > SILENT:
             return WARN, "silent" if age is None else f"silent for {age:.0f} s", values
-        return (WARN, f"refused: {', '.join(refused)}", values) if refused else (OK, "receiving", values)
+        return (*self._verdict(source, told), values)
+
+    def _verdict(self, source: str, told: Mapping[str, int]) -> tuple[int, str]:
+        """By the firewall's table: the worst of what it has said lately, and what to do about it."""
+        now, news = monotonic(), []
+        for id_, count in told.items():
+            before, when = self._said.get((source, id_), (0, 0.0))
+            when = now if count != before else when
+            self._said[source, id_] = (count, when)
+            if now - when < FRESH:
+                news.append(id_)
+        worst = max(news, key=lambda id_: LEVELS[_severity(id_)], default=None)
+        if worst is None:
+            return OK, "receiving"
+        rule = rule_of(worst)
+        advice = f": {rule.what}; {rule.advice}" if rule is not None else ""
+        verb = "refused" if any((source, id_) in self._state.refused for id_ in news) else "kept"
+        return LEVELS[_severity(worst)], f"{verb}: {', '.join(sorted(news, key=worst.__ne__))}{advice}"
 
     def _worker(self, feeder: Feeder | None, journal: Journal | None) -> tuple[int, str, dict[str, str]]:
         report, update = self._state.report, self._state.update
@@ -109,6 +136,12 @@ class Diagnostics:
         if feeder.backlog > BEHIND:
             return WARN, f"the worker is {feeder.backlog} records behind"
         return OK, "solving"
+
+
+def _severity(id_: str) -> Severity:
+    """Of the firewall's rules by their table; what another stage refuses is worth a look."""
+    rule = rule_of(id_)
+    return "warn" if rule is None else rule.severity
 
 
 def _status(name: str, level: int, message: str, values: Mapping[str, str]) -> Status:

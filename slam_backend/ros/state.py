@@ -6,6 +6,7 @@ from collections.abc import Callable
 from time import monotonic
 
 from ..core.backend import Update
+from ..core.firewall.rules import rule_of
 from ..core.graph import Decision
 from ..core.trajectory import Snapshot
 from ..io.worker import Report
@@ -26,6 +27,7 @@ class State:
         self.snapshot: Snapshot | None = None
         self.decided: dict[str, Decision] = {}
         self.refused: dict[tuple[str, str], int] = {}  # (source, stage/reason) -> count
+        self.noted: dict[tuple[str, str], int] = {}  # the same for what the firewall kept, with a remark
         self.incidents: deque[tuple[float, str]] = deque(
             maxlen=100
         )  # s on the monotonic clock, what happened
@@ -58,7 +60,7 @@ class State:
         """
         with self._lock:
             self._behind = rows
-            self.decided, self.refused, self._untold = {}, {}, []
+            self.decided, self.refused, self.noted, self._untold = {}, {}, {}, []
 
     def happen(self, what: str, decision: Decision | None = None) -> None:
         """Something went wrong."""
@@ -84,7 +86,7 @@ class State:
         """A new session."""
         with self._lock:
             self.report = self.update = self.covariance = self.snapshot = None
-            self.decided, self.refused, self._untold = {}, {}, []
+            self.decided, self.refused, self.noted, self._untold = {}, {}, {}, []
             self._unshown, self._behind = False, 0
 
     def untold_decisions(self) -> list[Decision]:
@@ -96,8 +98,10 @@ class State:
     def _decide(self, decision: Decision) -> None:
         self._untold.append(decision)
         self.decided[decision.id] = decision
-        if decision.verdict in ("refused", "removed"):
-            rule = (decision.source, f"{decision.stage}/{decision.reason}")
-            self.refused[rule] = self.refused.get(rule, 0) + decision.count
+        id_ = f"{decision.stage}/{decision.reason}"
+        refused = decision.verdict in ("refused", "removed")
+        if refused or rule_of(id_) is not None:
+            counts, rule = self.refused if refused else self.noted, (decision.source, id_)
+            counts[rule] = counts.get(rule, 0) + decision.count
         while len(self.decided) > DECISIONS:
             del self.decided[next(iter(self.decided))]

@@ -65,6 +65,7 @@ class _Bag:
             encoding,
             schema.encoding,
             schema.data.decode(errors="replace"),  # comments may be in any encoding
+            channel.metadata.get("offered_qos_profiles", ""),
         )
 
     def summary(self) -> bool:

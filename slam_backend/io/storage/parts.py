@@ -17,6 +17,7 @@ class Connection(NamedTuple):
 
     encoding: `cdr`, `ros1`, or `cdr.zstd` where each message is compressed; anything else cannot be read.
     schema: `ros2msg`, `ros1msg`, `ros2idl`, or empty where the file holds no definition.
+    qos: what its publishers offered, as rosbag2 writes it (YAML); empty where the file does not say.
     """
 
     topic: str
@@ -24,6 +25,7 @@ class Connection(NamedTuple):
     encoding: str = "cdr"
     schema: str = ""
     definition: str = ""
+    qos: str = ""
 
 
 Row = tuple[int, str, int, Connection, bytes]  # log time, topic, position in the part, connection, message

@@ -39,11 +39,18 @@ class _Bag:
                 )
             }
         return {
-            identity: Connection(str(topic), str(kind), str(encoding), *definitions.get(kind, ()))
-            for identity, topic, kind, encoding in self.database.execute(
-                "SELECT id, name, type, serialization_format FROM topics"
+            identity: Connection(
+                str(topic), str(kind), str(encoding), *definitions.get(kind, ("", "")), qos=str(qos or "")
+            )
+            for identity, topic, kind, encoding, qos in self.database.execute(
+                f"SELECT id, name, type, serialization_format, {self._offered()} FROM topics"  # noqa: S608
             )
         }
+
+    def _offered(self) -> str:
+        """The column of QoS profiles, which the oldest schema lacks."""
+        columns = {row[1] for row in self.database.execute("PRAGMA table_info(topics)")}
+        return "offered_qos_profiles" if "offered_qos_profiles" in columns else "''"
 
     def row(self, identity: int, topic: int, log_time: object, data: object) -> Row | None:
         """A row of the table, or None if it does not hold a message."""
