@@ -27,6 +27,7 @@ from slam_backend.io.encode import encode_odometry
 
 ODOMETRY = "nav_msgs/msg/Odometry"
 ZEROS = np.zeros(36), np.zeros(6), np.zeros(36)
+DEPTH = 10_000  # of its queues: what is lost is not lost by the sender
 DRIFT = 1.01  # radius that odometry sees, over the true one
 LATE = 0.2  # s from a keyframe to the loop that was found there
 MATCHING = 0.5  # s until both ends of a connection know of each other
@@ -65,7 +66,7 @@ def relative(i, j, radius):
 class Drive:
     def __init__(self, radius):
         self.radius, self.stamps, self.arcs = radius, [], []
-        node, profile = rclpy.create_node("load"), QoSProfile(depth=2000)
+        node, profile = rclpy.create_node("load"), QoSProfile(depth=DEPTH)
         self.odometry, self.loops = (
             node.create_publisher(class_of(ODOMETRY), topic, profile) for topic in ("/odom", "/loops")
         )
@@ -125,7 +126,7 @@ def hear(topic, type_):
             say(f"first {now / 1e9:.3f}")
         heard.append((stamp, (now - stamp) / 1e6))
 
-    node.create_subscription(class_of(type_), topic, take, QoSProfile(depth=2000), raw=True)
+    node.create_subscription(class_of(type_), topic, take, QoSProfile(depth=DEPTH), raw=True)
     say("ready")
     try:
         rclpy.spin(node)

@@ -15,7 +15,9 @@ from ..core.config import Config
 from ..core.sensors import SENSORS
 from ..io.inputs import TF_STATIC
 
-DEPTH = 2000  # messages; a full queue drops the oldest silently, even when reliable
+DEPTH = (
+    10_000  # messages: ten seconds at 1,000 Hz; a full queue drops the oldest silently, even when reliable
+)
 Received = Callable[[str, str, bytes], None]  # topic, type, CDR
 BEST_EFFORT, RELIABLE = ReliabilityPolicy.BEST_EFFORT, ReliabilityPolicy.RELIABLE
 LATCHED, VOLATILE = DurabilityPolicy.TRANSIENT_LOCAL, DurabilityPolicy.VOLATILE

@@ -36,6 +36,7 @@ from .parameters import changed, config_of, declare
 from .pose import Odometer
 from .services import Services
 from .session import RUN, Session
+from .snapshots import Snapshots
 from .state import State
 from .steadfast import SteadfastNode, explained, survived
 
@@ -60,9 +61,9 @@ class BackendNode(SteadfastNode):
         self.state = State(self._wake)
         self._typestore = typestore_of(())
         self._changed = self.create_guard_condition(self._publish)
-        self._refresh = threading.Event()
         self.session: Session | None = None
         self._intake: Intake | None = None
+        self._snapshots: Snapshots | None = None
         self._inputs: Inputs | None = None
         self._outputs: Outputs | None = None
         self._answering: Services | None = None
@@ -94,17 +95,17 @@ class BackendNode(SteadfastNode):
         self._outputs.set_active(False)
         self._diagnostics = Diagnostics(self, self.state)
         self.session = self._opened()
+        self._snapshots = Snapshots(self.state, self._feeder)
         with undisturbed():  # the services start a process
             self._answering = Services(
                 self,
                 self.state,
                 lambda: self.session,
-                self._refresh.set,
+                self._snapshots.ask,
                 self.data_dir,
                 self.config,
                 self.reset,
             )
-        threading.Thread(target=self._snapshots, args=(self._closed,), name="snapshots", daemon=True).start()
         return TransitionCallbackReturn.SUCCESS
 
     @explained
@@ -139,7 +140,6 @@ class BackendNode(SteadfastNode):
     def close(self) -> None:
         """Save the run, let go of everything. Safe to call twice."""
         self._closed.set()
-        self._refresh.set()
         self._silence()
         with self._changing:
             if self._intake is not None:
@@ -147,10 +147,10 @@ class BackendNode(SteadfastNode):
             session, self.session = self.session, None
             if session is not None:
                 self._end(session)
-        for part in (self._answering, self._outputs, self._diagnostics):
+        for part in (self._snapshots, self._answering, self._outputs, self._diagnostics):
             if part is not None:
                 part.close()
-        self._answering = self._outputs = self._diagnostics = self._intake = None
+        self._snapshots = self._answering = self._outputs = self._diagnostics = self._intake = None
 
     def reset(self) -> None:
         """A new session: the run so far is saved, its journal set aside, the map starts empty. Takes a while; any thread.
@@ -316,29 +316,11 @@ class BackendNode(SteadfastNode):
             outputs.landmarks(snapshot)
             outputs.graph(snapshot, list(self.state.decided.values()))
 
-    def _snapshots(self, closed: threading.Event) -> None:
-        """A thread: fetch a snapshot when one is asked for and there is something new."""
-        shown = None
-        while not closed.is_set():
-            self._refresh.wait()
-            self._refresh.clear()
-            feeder, update = self._feeder(), self.state.update
-            if closed.is_set() or feeder is None or update is None or update is shown:
-                continue
-            begin = monotonic()
-            try:
-                snapshot = feeder.request("snapshot", timeout=FAREWELL)
-            except SlamError:
-                continue  # the worker is being replaced; there will be another
-            if feeder is self._feeder():
-                self.state.show(snapshot)
-                shown = update
-            closed.wait(4 * (monotonic() - begin))  # at most a fifth of the worker's time
-
     @survived
     def _refresh_if_watched(self) -> None:
-        if self._outputs is not None and any(map(self._outputs.has_listeners, WATCHED)):
-            self._refresh.set()
+        outputs, snapshots = self._outputs, self._snapshots
+        if outputs is not None and snapshots is not None and any(map(outputs.has_listeners, WATCHED)):
+            snapshots.ask()
 
     @survived
     def _diagnose(self) -> None:

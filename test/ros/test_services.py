@@ -25,7 +25,6 @@ from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from std_srvs.srv import SetBool, Trigger
 
 import slam_backend as sb
-from slam_backend.core.errors import SlamError
 from slam_backend.core.measurement import format_stamp
 from slam_backend.io.bags import open_bag
 from slam_backend.io.encode import encode_odometry
@@ -33,6 +32,7 @@ from slam_backend.io.feeder import Feeder
 from slam_backend.io.journal import Journal
 from slam_backend.ros.services import Services
 from slam_backend.ros.session import Session
+from slam_backend.ros.snapshots import Snapshots
 from slam_backend.ros.state import State
 
 BAGS = Path(__file__).parents[2] / "bags"
@@ -52,12 +52,11 @@ class Host:
         self.config = sb.load_config(BAGS / "warehouse.yaml")
         self.node = rclpy.create_node("slam_backend", namespace=records)
         self.state = State(lambda: None)
-        self.asked = threading.Event()
         self.sessions = 0
         self.begin()
-        threading.Thread(target=self.snapshots, daemon=True).start()
+        snapshots = Snapshots(self.state, lambda: self.session.feeder)
         self.services = Services(
-            self.node, self.state, lambda: self.session, self.asked.set, data_dir, self.config, self.reset
+            self.node, self.state, lambda: self.session, snapshots.ask, data_dir, self.config, self.reset
         )
 
     def begin(self) -> None:
@@ -78,15 +77,6 @@ class Host:
         self.session.end(30)
         self.state.clear()
         self.begin()
-
-    def snapshots(self) -> None:
-        while True:
-            self.asked.wait()
-            self.asked.clear()
-            if self.state.update is None:
-                continue
-            with suppress(SlamError):  # a new session has begun meanwhile
-                self.state.show(self.feeder.request("snapshot", timeout=60))
 
     def feed(self) -> None:
         if self.records == "nothing":
