@@ -52,7 +52,7 @@ def test_a_whole_life(backend, peer, life, drive) -> None:
     assert not life.change(77)
     assert life.change(Transition.TRANSITION_CONFIGURE)
     assert not life.change(Transition.TRANSITION_CONFIGURE)
-    heard = peer.hear("/slam_backend/odometry", ODOMETRY)
+    heard = peer.hear("/slam_backend/pose", "geometry_msgs/msg/PoseWithCovarianceStamped")
     told = peer.hear("/diagnostics", "diagnostic_msgs/msg/DiagnosticArray")
     waiting = peer.publisher("/odom", ODOMETRY)
     peer.spin(1.5)

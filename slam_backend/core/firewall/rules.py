@@ -177,7 +177,8 @@ def decided(
 ) -> Decision:
     """A Decision about a record, in the words of its rule."""
     rule, (stage, _, reason) = RULES[id_], id_.partition("/")
+    ends = None if verdict == "accepted" else item.ends  # the verdict on a loop that is taken is still to come
     return Decision(
         item.stamp, f"{item.source}/{format_stamp(item.stamp)}", item.source, verdict, stage, reason,
-        rule.what, statistic, rule.threshold if threshold is None else threshold, item.ends, count,
+        rule.what, statistic, rule.threshold if threshold is None else threshold, ends, count,
     )  # fmt: skip
