@@ -177,7 +177,8 @@ def decided(
 ) -> Decision:
     """A Decision about a record, in the words of its rule."""
     rule, (stage, _, reason) = RULES[id_], id_.partition("/")
-    ends = None if verdict == "accepted" else item.ends  # the verdict on a loop that is taken is still to come
+    # One that is taken has its verdict, if it is a loop, still to come.
+    ends = None if verdict == "accepted" else item.ends
     return Decision(
         item.stamp, f"{item.source}/{format_stamp(item.stamp)}", item.source, verdict, stage, reason,
         rule.what, statistic, rule.threshold if threshold is None else threshold, ends, count,
