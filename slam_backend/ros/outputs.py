@@ -4,7 +4,6 @@ Nothing is encoded for nobody. A volatile topic without listeners is left alone;
 is kept, and encoded when the first listener comes. Call from the executor's thread only.
 """
 
-import json
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
@@ -21,11 +20,10 @@ from visualization_msgs.msg import MarkerArray
 
 from ..core.backend import Update
 from ..core.config import Config
-from ..core.decisions import as_json
 from ..core.graph import Decision
 from ..core.trajectory import Snapshot
+from ..io.drawing import drawn_graph, landmark_cloud, newest, status_of, trajectory_cloud
 from ..io.encode import (
-    Status,
     encode_diagnostics,
     encode_markers,
     encode_odometry,
@@ -34,7 +32,6 @@ from ..io.encode import (
     encode_transform,
     encode_transforms,
 )
-from .drawing import drawn_graph, landmark_cloud, trajectory_cloud
 from .pose import UNKNOWN
 
 LATCHED = QoSProfile(
@@ -58,7 +55,6 @@ OUTPUTS: dict[str, tuple[Any, QoSProfile]] = {  # name below the node's own -> t
 }
 TF = "/tf"
 
-LEVELS = {"accepted": 0, "restored": 0, "probation": 1, "refused": 2, "removed": 2}  # OK, WARN, ERROR
 STATUSES = 100  # per message
 
 
@@ -198,20 +194,3 @@ class Outputs:
         """Publish what is due, if anybody listens."""
         if topic in self._due and self.has_listeners(topic):
             self._publishers[topic].publish(self._due.pop(topic)())
-
-
-def newest(snapshot: Snapshot) -> int:
-    """Stamp of the newest keyframe; 0 without any."""
-    return int(snapshot.stamps[-1]) if len(snapshot.stamps) else 0
-
-
-def status_of(decision: Decision) -> Status:
-    """name: the id; message: `stage/reason: detail`; hardware id: the source; values: a line of decisions.jsonl, nulls left out."""
-    rule = f"{decision.stage}/{decision.reason}"
-    values = {
-        key: value if isinstance(value, str) else json.dumps(value)
-        for key, value in as_json(decision).items()
-        if value is not None
-    }
-    message = f"{rule}: {decision.detail}" if decision.detail else rule
-    return Status(LEVELS[decision.verdict], decision.id, message, decision.source, values)

@@ -1,15 +1,17 @@
-"""A snapshot as clouds and markers."""
+"""A snapshot as clouds and markers, decisions as lines of diagnostics."""
 
+import json
 from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ..core.decisions import as_json
 from ..core.graph import Decision
 from ..core.measurement import SECOND, Array
 from ..core.trajectory import Snapshot
-from ..io.encode import Marker, encode_cloud
+from .encode import Marker, Status, encode_cloud
 
 Color = tuple[float, float, float, float]
 
@@ -20,6 +22,9 @@ LOOPS: dict[str, tuple[frozenset[str], Color]] = {  # marker -> verdicts that it
     "probation": (frozenset({"probation"}), (1.0, 0.6, 0.1, 1.0)),
     "refused": (frozenset({"refused", "removed"}), (0.9, 0.1, 0.1, 1.0)),
 }
+
+
+LEVELS = {"accepted": 0, "restored": 0, "probation": 1, "refused": 2, "removed": 2}  # OK, WARN, ERROR
 
 
 def trajectory_cloud(stamp: int, frame: str, snapshot: Snapshot, covariances: ArrayLike | None) -> bytes:
@@ -77,3 +82,20 @@ def _lines(snapshot: Snapshot, ends: list[tuple[int, int] | None]) -> Array:
     stamps = np.array(ends, dtype=np.int64).ravel()
     pairs = snapshot.at(stamps)[:, :3].reshape(-1, 6)
     return pairs[~np.isnan(pairs).any(axis=1)].reshape(-1, 3)
+
+
+def newest(snapshot: Snapshot) -> int:
+    """Stamp of the newest keyframe; 0 without any."""
+    return int(snapshot.stamps[-1]) if len(snapshot.stamps) else 0
+
+
+def status_of(decision: Decision) -> Status:
+    """name: the id; message: `stage/reason: detail`; hardware id: the source; values: a line of decisions.jsonl, nulls left out."""
+    rule = f"{decision.stage}/{decision.reason}"
+    values = {
+        key: value if isinstance(value, str) else json.dumps(value)
+        for key, value in as_json(decision).items()
+        if value is not None
+    }
+    message = f"{rule}: {decision.detail}" if decision.detail else rule
+    return Status(LEVELS[decision.verdict], decision.id, message, decision.source, values)

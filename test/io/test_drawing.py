@@ -8,7 +8,7 @@ from slam_backend.core.graph import Decision
 from slam_backend.core.measurement import SECOND
 from slam_backend.core.sensors.cloud import columns
 from slam_backend.core.trajectory import Snapshot, Trajectory
-from slam_backend.ros.drawing import drawn_graph, landmark_cloud, trajectory_cloud
+from slam_backend.io.drawing import drawn_graph, landmark_cloud, trajectory_cloud
 
 STORE = get_typestore(Stores.ROS2_JAZZY)
 
