@@ -1,4 +1,4 @@
-"""`slam-backend convert IN OUT`: pose graphs and trajectories from one format to another."""
+"""`slam-backend convert IN OUT`: pose graphs, trajectories and finished runs from one format to another."""
 
 import json
 from pathlib import Path
@@ -8,12 +8,13 @@ import typer
 
 
 def command(
-    source: Annotated[Path, typer.Argument(metavar="IN", help="Told by its content.")],
+    source: Annotated[Path, typer.Argument(metavar="IN", help="Told by its content; or a run directory.")],
     target: Annotated[
         Path,
         typer.Argument(
             metavar="OUT",
-            help="Told by its extension. Graphs: .g2o .graph .toro .pyfg; trajectories: .tum .txt .kitti .euroc .csv",
+            help="Told by its extension. Graphs: .g2o .graph .toro .pyfg; trajectories: .tum .txt .kitti .euroc .csv; "
+            "of a run also .ply and .geojson",
         ),
     ],
     rotation_information: Annotated[
@@ -23,10 +24,23 @@ def command(
             "g2o: of the quaternion's vector part, half of that, so that the same numbers weigh a fourth."
         ),
     ] = "gtsam",
+    origin: Annotated[
+        str | None,
+        typer.Option(
+            metavar="LAT,LON[,ALT[,YAW]]",
+            help="For .geojson: where the map's origin lies (degrees, m), and its x axis, degrees from east to north.",
+        ),
+    ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print what was done as JSON.")] = False,
 ) -> None:
-    """Convert a pose graph or a trajectory, and say what the new format cannot hold."""
-    from ..io.formats import convert
+    """Convert a pose graph, a trajectory or a finished run, and say what the new format cannot hold."""
+    if source.is_dir():
+        from ..io.maps import export, origin_of
+        from ..io.rundir import FinishedRun
 
-    done = convert(source, target, rotation_information=rotation_information)
+        done = export(FinishedRun(source), target, origin_of(origin) if origin else None)
+    else:
+        from ..io.formats import convert
+
+        done = convert(source, target, rotation_information=rotation_information)
     typer.echo(json.dumps({"source": str(source), "target": str(target), "done": done}) if as_json else done)

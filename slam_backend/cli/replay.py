@@ -46,6 +46,13 @@ def command(
             metavar="K=A,B,C", help="A run for each value of a setting; may be given several times."
         ),
     ] = None,
+    bag: Annotated[
+        Literal["link", "copy"] | None,
+        typer.Option(
+            help="Write run.mcap for Foxglove and RViz: path, map -> odom, landmarks, graph, decisions. "
+            "copy: with the inputs in it; link: with links to them beside it."
+        ),
+    ] = None,
     report: Annotated[
         bool, typer.Option(help="Write report.html, the page that answers what people ask.")
     ] = True,
@@ -67,7 +74,7 @@ def command(
     if sweep and rerun:
         raise BadConfig("--rerun: shows one run; leave it out, or --sweep")
     target = out or Path("runs") / inputs[0].stem
-    job = Job(tuple(inputs), config, tuple(settings or ()), final, estimator, report, rerun, target)
+    job = Job(tuple(inputs), config, tuple(settings or ()), final, estimator, bag, report, rerun, target)
     if sweep:
         _sweep(job, sweep, as_json)
         return
@@ -87,6 +94,7 @@ class Job:
     settings: tuple[str, ...]
     final: Literal["none", "batch"]
     estimator: str
+    bag: Literal["link", "copy"] | None
     report: bool
     rerun: str | None
     out: Path
@@ -97,6 +105,7 @@ def work(job: Job, shown: "Progress") -> "Result":
     from ..io.configfile import load_config
     from ..io.history import NAME, History
     from ..io.replay import replay
+    from ..io.resultbag import write_result_bag
     from ..io.rundir import prepare, write_run
     from ..lab.ekf import ESTIMATORS
     from ..lab.picture import PICTURE, draw
@@ -113,6 +122,8 @@ def work(job: Job, shown: "Progress") -> "Result":
     write_run(run.result, job.out)
     history.write(job.out / NAME)
     draw(run.result, job.out / PICTURE)
+    if job.bag:
+        write_result_bag(run.result, job.out, job.bag)
     if viewer:
         viewer.finish()
     if job.report:

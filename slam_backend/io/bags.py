@@ -58,7 +58,7 @@ class Bag:
     def __init__(self, path: Path, opened: "_Opened", stack: ExitStack) -> None:
         self.path = path
         self._opened, self._stack = opened, stack
-        self._connections = [c for content in opened.contents for c in content.connections]
+        self.connections = [c for content in opened.contents for c in content.connections]
         self._to_cdr = {**_TO_CDR, "cdr": _unpacked} if opened.compressed else _TO_CDR
         self._lost: dict[str, tuple[int, str]] = {}  # topic -> messages left out, why the first one was
 
@@ -77,7 +77,7 @@ class Bag:
         counts: Counter[str] = Counter()
         for content in self._opened.contents:
             counts.update(content.counts)
-        readable = [c for c in self._connections if c.encoding in _TO_CDR]
+        readable = [c for c in self.connections if c.encoding in _TO_CDR]
         types = {c.topic: c.type for c in reversed(readable)}
         return {name: Topic(types[name], counts[name]) for name in sorted(types)}
 
@@ -103,7 +103,7 @@ class Bag:
     @cached_property
     def typestore(self) -> Typestore:
         """Jazzy's message types and those that the bag defines."""
-        return typestore_of(self._connections)
+        return typestore_of(self.connections)
 
     def records(self, topics: Topics = None) -> Iterator[Record]:
         """The messages of `topics` (None: all), in order. Names that are not in the bag yield nothing."""

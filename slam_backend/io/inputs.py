@@ -17,7 +17,7 @@ from ..core.sensors import SENSORS
 from . import events
 from .bags import Bag, Topic, open_bag
 from .cdr import DECODERS, Decoder
-from .formats import FORMATS, read_graph
+from .formats import endings, read_graph
 from .formats.posegraph import PERIOD, PoseGraph, measurements
 from .records import Record
 
@@ -186,8 +186,7 @@ def open_inputs(paths: Sequence[Path | str]) -> BagInputs | GraphInput:
     found = [Path(path) for path in paths]
     if not found:
         raise BadFile("no input: name a bag, a journal or a pose graph")
-    endings = tuple(end for form in FORMATS if form.kind == "graph" for end in form.extensions)
-    graphs = [path for path in found if path.name.lower().endswith(endings)]
+    graphs = [path for path in found if path.name.lower().endswith(endings("graph"))]
     if not graphs:
         return BagInputs(found)
     if len(found) > 1:

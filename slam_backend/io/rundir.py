@@ -37,7 +37,9 @@ FILES = ("summary.json", "config.yaml", "trajectory.tum", "odometry.tum", "onlin
 
 
 ALIKE = 1e-6  # m and of quaternions; between replays on different machines
-DRAWN = ("trajectory.png", "report.html", HISTORY)  # by the command line
+RESULT_BAG = "run.mcap"
+INPUTS = "inputs"  # a folder of symbolic links
+DRAWN = ("trajectory.png", "report.html", HISTORY, RESULT_BAG)  # by the command line
 
 
 def write_run(result: Result, out: Path | str) -> None:
@@ -47,6 +49,8 @@ def write_run(result: Result, out: Path | str) -> None:
     out.mkdir(parents=True, exist_ok=True)
     for stale in ("summary.json", *DRAWN):  # the summary comes last, and says that the run is whole
         (out / stale).unlink(missing_ok=True)
+    for link in _links(out):
+        link.unlink()
     snapshot = result.snapshot
     for name, trajectory in (
         ("trajectory", snapshot.trajectory),
@@ -79,7 +83,8 @@ def prepare(out: Path) -> None:
 
 def _is_run(out: Path) -> bool:
     """Whether a directory holds nothing but a run, whole or broken off."""
-    if any(path.name not in (*FILES, *DRAWN) for path in out.iterdir()):
+    known = {*FILES, *DRAWN, *([INPUTS] if all(path.is_symlink() for path in _links(out)) else [])}
+    if any(path.name not in known for path in out.iterdir()):
         return False
     try:
         return "run_hash" in json.loads((out / "summary.json").read_text(encoding="utf-8"))
@@ -87,6 +92,12 @@ def _is_run(out: Path) -> bool:
         return True  # broken off before its summary was written
     except (OSError, ValueError):
         return False
+
+
+def _links(out: Path) -> list[Path]:
+    """What is in the folder of links to the inputs."""
+    folder = out / INPUTS
+    return list(folder.iterdir()) if folder.is_dir() else []
 
 
 def _write_decisions(path: Path, result: Result) -> None:

@@ -1,18 +1,27 @@
 """Records to a bag: an .mcap file, or a rosbag2 folder with sqlite3. Equal input gives equal bytes."""
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
+import yaml
 from mcap.writer import Writer as McapWriter
+from rosbags.interfaces import Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
 from rosbags.rosbag2 import StoragePlugin, WriterError
 from rosbags.rosbag2 import Writer as FolderWriter
+from rosbags.rosbag2.metadata import dump_qos_v9
 from rosbags.typesys import TypesysError
 from rosbags.typesys.store import Typestore
 
 from ..core.errors import BadFile
 from .records import Record
 from .typestore import typestore_of
+
+_NEVER = QosTime(9223372036, 854775807)  # how ROS writes that there is no deadline
+LATCHED = Qos(
+    QosHistory.KEEP_LAST, 1, QosReliability.RELIABLE, QosDurability.TRANSIENT_LOCAL, _NEVER, _NEVER,
+    QosLiveliness.AUTOMATIC, _NEVER, avoid_ros_namespace_conventions=False,
+)  # fmt: skip
 
 
 def write_bag(
@@ -22,12 +31,14 @@ def write_bag(
     *,
     strictly_increasing: bool = False,
     chunk_bytes: int = 1 << 20,
+    latched: Collection[str] = ("/tf_static",),
 ) -> int:
     """Write a new bag and return the number of records: `.mcap` one file, any other name a folder with sqlite3.
 
     typestore: definitions of the types, ROS 2 Jazzy's if not given; to copy a bag give `bag.typestore`.
     strictly_increasing: move a log time that is not later than the one before to one nanosecond after it.
     chunk_bytes: of messages in one compressed chunk of an .mcap file.
+    latched: topics of which a player is to keep the last message for those who come later (transient local).
     BadFile if the path exists, cannot be written, or a type is not known. On any exception nothing is left behind.
     """
     path = Path(path)
@@ -44,9 +55,9 @@ def write_bag(
         with TemporaryDirectory(prefix=".writing-", dir=path.parent) as folder:
             unfinished = Path(folder) / path.name
             if path.suffix == ".mcap":
-                count = _write_mcap(unfinished, rising, store, chunk_bytes)
+                count = _write_mcap(unfinished, rising, store, chunk_bytes, latched)
             else:
-                count = _write_folder(unfinished, rising, store)
+                count = _write_folder(unfinished, rising, store, latched)
             unfinished.rename(path)
     except (OSError, WriterError) as error:
         raise BadFile(f"{path}: cannot be written: {getattr(error, 'strerror', None) or error}") from None
@@ -62,7 +73,9 @@ def _rising(records: Iterable[Record]) -> Iterator[Record]:
         yield record if last == record.log_time else Record(record.topic, record.type, last, record.data)
 
 
-def _write_mcap(path: Path, records: Iterator[Record], store: Typestore, chunk_bytes: int) -> int:
+def _write_mcap(
+    path: Path, records: Iterator[Record], store: Typestore, chunk_bytes: int, latched: Collection[str]
+) -> int:
     schemas: dict[str, int] = {}
     channels: dict[tuple[str, str], int] = {}
     count = 0
@@ -75,19 +88,23 @@ def _write_mcap(path: Path, records: Iterator[Record], store: Typestore, chunk_b
                 if record.type not in schemas:
                     text, _ = store.generate_msgdef(record.type, ros_version=2)
                     schemas[record.type] = writer.register_schema(record.type, "ros2msg", text.encode())
-                channel = writer.register_channel(record.topic, "cdr", schemas[record.type])
+                profiles = yaml.safe_dump(dump_qos_v9([LATCHED])) if record.topic in latched else ""
+                channel = writer.register_channel(
+                    record.topic, "cdr", schemas[record.type], {"offered_qos_profiles": profiles}
+                )
                 channels[record.topic, record.type] = channel
             writer.add_message(channel, record.log_time, record.data, record.log_time, sequence=count)
         writer.finish()  # type: ignore[no-untyped-call]  # mcap leaves it untyped
     return count
 
 
-def _write_folder(path: Path, records: Iterator[Record], store: Typestore) -> int:
+def _write_folder(path: Path, records: Iterator[Record], store: Typestore, latched: Collection[str]) -> int:
     with FolderWriter(path, version=9, storage_plugin=StoragePlugin.SQLITE3) as writer:
         connections = {}
         for record in records:
             key = record.topic, record.type
             if key not in connections:
-                connections[key] = writer.add_connection(*key, typestore=store)
+                profiles = [LATCHED] if record.topic in latched else []
+                connections[key] = writer.add_connection(*key, typestore=store, offered_qos_profiles=profiles)
             writer.write(connections[key], record.log_time, record.data)
     return sum(writer.counts.values())

@@ -39,6 +39,11 @@ FORMATS: tuple[Format, ...] = (
 HEAD = 65536  # bytes that are looked at to tell the format of a file
 
 
+def endings(kind: Kind) -> tuple[str, ...]:
+    """The extensions of all formats of a kind."""
+    return tuple(end for form in FORMATS if form.kind == kind for end in form.extensions)
+
+
 def read_graph(path: Path, rotation_information: "Convention" = "gtsam") -> "PoseGraph":
     """A pose graph of any format, told by its content. BadFile: `<file>:<line>: <words>: <what is wrong>`.
 
