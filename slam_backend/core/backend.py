@@ -81,7 +81,7 @@ class Backend:
         self.config = config = config if config.sources else config.model_copy(update={"sources": SOURCES})
         self.space = space = SPACES[config.space]
         self.solver = solver or SOLVERS["isam2"](config, space)
-        paths = Paths(space, config.gate.odometry_scale, self.solver.factors)
+        self._paths = paths = Paths(space, config.gate.odometry_scale, self.solver.factors)
         self._robust = [ROBUST[name](config, paths) for name in config.robust] if robust is None else robust
         self._driver = config.driver
         if self._driver is None:
@@ -140,6 +140,9 @@ class Backend:
         while self._newest and self._waiting:  # what was waiting for that, or was put back
             updates += self._close(last=True)
         self._decisions += self._waiting.leftovers()
+        if self._newest and self._robust:
+            self._paths.ended = True
+            self._judge(Delta())
         if self._newest and self._decisions:
             updates.append(self._told(self._newest[0]))
         return updates

@@ -21,7 +21,7 @@ from .errors import BadConfig
 LIVE: dict[str, Any] = {"live": True}  # settings that a running node takes; all others are read-only there
 
 KernelName = Literal["none", "huber", "cauchy", "tukey", "geman_mcclure", "dcs"]
-StageName = Literal["gate", "witness"]
+StageName = Literal["gate", "witness", "pcm", "gnc", "switchable", "max_mixture", "rrr"]
 
 
 class Section(BaseModel):
@@ -105,6 +105,63 @@ class Gate(Section):
         gt=0,
         le=1000,
         description="what the odometry's standard deviations are multiplied by: stated noise leaves out bias and correlation",
+    )
+
+
+class Pcm(Section):
+    """Pairwise consistency maximization: the largest set of loops that agree (Mangelson et al., ICRA 2018)."""
+
+    probability: float = Field(
+        0.99, gt=0, lt=1, description="with which two true loops agree, if all noise is as stated and scaled"
+    )
+    smallest: int = Field(2, ge=1, le=100, description="loops that the set must have at least")
+    steps: int = Field(
+        20_000,
+        ge=1,
+        le=100_000_000,
+        description="loops tried in the search for one new loop; beyond, it is not exact",
+    )
+
+
+class Gnc(Section):
+    """Graduated non-convexity, aside (Yang et al., RA-L 2020)."""
+
+    every: int = Field(200, ge=1, le=1_000_000, description="keyframes from one judgment to the next")
+    lag: int = Field(
+        50, ge=1, le=1_000_000, description="keyframes from the begin of a judgment to its landing"
+    )
+
+
+class Switchable(Section):
+    """Switchable constraints in closed form (Sünderhauf & Protzel, IROS 2012; Agarwal et al., ICRA 2013)."""
+
+    phi: float = Field(
+        1.0,
+        gt=0,
+        le=1e6,
+        description="what it costs to switch a loop off; a chi-square up to this is left alone by dcs",
+    )
+    form: Literal["dcs", "exact"] = Field(
+        default="dcs", description="dcs: dynamic covariance scaling; exact: the quadratic prior of the paper"
+    )
+
+
+class MaxMixture(Section):
+    """Each loop as it is or a null hypothesis, whichever is likelier (Olson & Agarwal, IJRR 2013)."""
+
+    weight: float = Field(0.01, gt=0, lt=1, description="of the null hypothesis")
+    scale: float = Field(1e-12, gt=0, lt=1, description="of the information, in the null hypothesis")
+
+
+class Rrr(Section):
+    """Clusters of loops that agree within and between, aside (Latif et al., IJRR 2013)."""
+
+    gap: float = Field(
+        10.0, ge=0, le=1e6, description="m of odometry between neighbours in a cluster, at each end"
+    )
+    every: int = Field(200, ge=1, le=1_000_000, description="keyframes from one judgment to the next")
+    lag: int = Field(
+        50, ge=1, le=1_000_000, description="keyframes from the begin of a judgment to its landing"
     )
 
 
@@ -216,6 +273,11 @@ class Config(Section):
     settle: Settle = Settle()
     isam2: Isam2 = Isam2()
     gate: Gate = Gate()
+    pcm: Pcm = Pcm()
+    gnc: Gnc = Gnc()
+    switchable: Switchable = Switchable()
+    max_mixture: MaxMixture = MaxMixture()
+    rrr: Rrr = Rrr()
     robust: tuple[StageName, ...] = Field(
         (), description="what judges loops before they enter the graph, in this order; empty: nothing does"
     )

@@ -7,31 +7,22 @@ robust kernels, which act per source.
 """
 
 from collections.abc import Callable, Mapping
-from typing import Protocol
 
 from ..config import Config, StageName
-from ..graph import Decision, Delta, Estimate
+from .gnc import Gnc
+from .max_mixture import MaxMixture
 from .paths import Paths
+from .pcm import Pcm
+from .rrr import Rrr
+from .stage import Judged, Robust
+from .switchable import Switchable
 
-Judged = tuple[Delta, tuple[Decision, ...]]
+__all__ = ["ROBUST", "Judged", "Paths", "Robust"]
 
-
-class Robust(Protocol):
-    @property
-    def kinds(self) -> frozenset[str]:
-        """Of the factors it judges; all others enter unjudged."""
-        ...
-
-    def admit(self, proposed: Delta, estimate: Estimate) -> Judged:
-        """What of the proposed change may enter, and a decision for each factor."""
-        ...
-
-    def review(self, estimate: Estimate) -> Judged:
-        """Second thoughts about what entered earlier or waits, once the estimate is new.
-
-        What it removes is decided here; what it adds is decided once the other stages have judged it, and the solver taken it.
-        """
-        ...
-
-
-ROBUST: Mapping[StageName, Callable[[Config, Paths], Robust]] = {}
+ROBUST: Mapping[StageName, Callable[[Config, Paths], Robust]] = {
+    "pcm": Pcm,
+    "gnc": Gnc,
+    "switchable": Switchable,
+    "max_mixture": MaxMixture,
+    "rrr": Rrr,
+}

@@ -118,6 +118,7 @@ class Paths:
         self._links: dict[str, int] = {}  # id -> row below
         self._rows: list[Link | None] = []  # None: removed
         self._sides = Sides()
+        self.ended = False  # the input: what is not decided now never will be
         self.revision = 0  # grows with every loop that enters or leaves
 
     def book(self, delta: Delta) -> None:
@@ -148,6 +149,12 @@ class Paths:
         if p is None or q is None or p.chain != q.chain:
             return None
         return self._chains[p.chain].stretch(p.row, q.row)
+
+    def from_origin(self, key: int) -> tuple[int, Path] | None:
+        """The chain on which a key lies, and the motion from the chain's first pose; None for one that no motion reaches."""
+        self._read()
+        point = self._points.get(key)
+        return None if point is None else (point.chain, self._chains[point.chain].stretch(0, point.row))
 
     def cheapest(self, a: int, b: int, without: Collection[str] = ()) -> Path | None:
         """Between two keys by motion and loops; None where nothing connects them. without: ids of loops not to be used."""
