@@ -84,7 +84,7 @@ class Bag:
     @cached_property
     def qos(self) -> dict[str, str]:
         """By topic: reliability and durability that its publishers offered, the weakest of each; only where the bag says."""
-        said = ((c.topic, offered_qos(c.qos)) for c in self._connections if c.qos)
+        said = ((c.topic, offered_qos(c.qos)) for c in self.connections if c.qos)
         return {topic: words for topic, words in said if words}
 
     @property
