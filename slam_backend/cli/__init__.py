@@ -28,6 +28,7 @@ VERBS: Mapping[
     "dataset": "A public data set that ships with gtsam, as a bag.",
     "simulate": "A world with ground truth, as a bag.",
     "convert": "A pose graph or trajectory from one format to another.",
+    "edit": "Loops and other factors of a finished run disabled, forced, reweighted; undone.",
     "report": "A page that answers what people ask of a run.",
     "doctor": "A recording as the firewall sees it: what each topic holds, and what to mend.",
     "query": "Poses at any stamp, covariances, landmarks, decisions of a finished run.",

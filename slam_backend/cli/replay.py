@@ -15,7 +15,9 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
     from ..core.backend import Update
+    from ..io.history import History
     from ..io.replay import Result, Run
+    from ..io.resultbag import With
 
 
 def command(
@@ -94,7 +96,7 @@ class Job:
     settings: tuple[str, ...]
     final: Literal["none", "batch"]
     estimator: str
-    bag: Literal["link", "copy"] | None
+    bag: "With | None"
     report: bool
     rerun: str | None
     out: Path
@@ -103,14 +105,10 @@ class Job:
 def work(job: Job, shown: "Progress") -> "Result":
     """Replay, and write the run directory."""
     from ..io.configfile import load_config
-    from ..io.history import NAME, History
+    from ..io.history import History
     from ..io.replay import replay
-    from ..io.resultbag import write_result_bag
-    from ..io.rundir import prepare, write_run
+    from ..io.rundir import prepare
     from ..lab.ekf import ESTIMATORS
-    from ..lab.picture import PICTURE, draw
-    from ..lab.report import REPORT, write_report
-    from ..lab.report.subject import Subject
     from ..lab.viewer import Viewer
 
     prepare(job.out)
@@ -118,17 +116,29 @@ def work(job: Job, shown: "Progress") -> "Result":
     run = replay(job.inputs, config, job.settings, job.final, ESTIMATORS[job.estimator])
     history = History(run)
     viewer = Viewer(run, job.rerun) if job.rerun else None
-    _watch(run, [history.see, *([viewer.see] if viewer else [])], shown)
-    write_run(run.result, job.out)
-    history.write(job.out / NAME)
-    draw(run.result, job.out / PICTURE)
-    if job.bag:
-        write_result_bag(run.result, job.out, job.bag)
+    watch(run, [history.see, *([viewer.see] if viewer else [])], shown)
+    write(run.result, history, job.out, job.report, job.bag)
     if viewer:
         viewer.finish()
-    if job.report:
-        write_report(Subject(job.out), job.out / REPORT)
     return run.result
+
+
+def write(result: "Result", history: "History", out: Path, report: bool, bag: "With | None") -> None:
+    """All files of a run directory."""
+    from ..io.history import NAME
+    from ..io.resultbag import write_result_bag
+    from ..io.rundir import write_run
+    from ..lab.picture import PICTURE, draw
+    from ..lab.report import REPORT, write_report
+    from ..lab.report.subject import Subject
+
+    write_run(result, out)
+    history.write(out / NAME)
+    draw(result, out / PICTURE)
+    if bag:
+        write_result_bag(result, out, bag)
+    if report:
+        write_report(Subject(out), out / REPORT)
 
 
 def aside(job: Job) -> str:
@@ -166,7 +176,7 @@ def _sweep(job: Job, sweeps: "Sequence[str]", as_json: bool) -> None:
         raise typer.Exit(2)
 
 
-def _watch(run: "Run", watchers: "Sequence[Callable[[Update], None]]", shown: "Progress") -> None:
+def watch(run: "Run", watchers: "Sequence[Callable[[Update], None]]", shown: "Progress") -> None:
     with shown("replay", run.inputs.count) as advance:
         told = 0
         for update in run:

@@ -15,6 +15,7 @@ from .command import Command
 from .config import Config, LandmarkSource, OdometrySource, PoseSource, RelativeSource
 from .context import Context
 from .editor import Editor, Shift
+from .edits import Wishes
 from .errors import BadConfig, SlamError, SolverFailure
 from .graph import (
     Decision,
@@ -314,6 +315,11 @@ class Backend:
         """What a command would come to; nothing is touched. SlamError where it would be refused."""
         self._editor.note(self._decisions)
         return {**self._editor.plan(action, arguments).told, "revision": self._revision}
+
+    @property
+    def wishes(self) -> Wishes:
+        """What a person has decided about single factors."""
+        return self._editor.wishes
 
     # -- the way of a change ---------------------------------------------------------------------
 

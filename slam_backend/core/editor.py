@@ -74,6 +74,10 @@ class Editor:
         ] = {}  # as they were made: what stages judge, and what a person has edited
         self._said: dict[str, Verdict] = {}  # of those: the last verdict that was not a person's
 
+    @property
+    def wishes(self) -> Wishes:
+        return self._history.now
+
     # -- what a person asks ----------------------------------------------------------------------
 
     def plan(self, action: str, arguments: Mapping[str, Any]) -> Plan:

@@ -15,6 +15,7 @@ import numpy as np
 
 from ..core.backend import Backend, Update
 from ..core.check import checked, rechecked
+from ..core.command import Command
 from ..core.config import Config, config_from, config_hash, config_to
 from ..core.decisions import DecisionLog
 from ..core.errors import BadFile
@@ -28,6 +29,7 @@ from ..core.space import SPACES, Space
 from ..core.trajectory import Snapshot, Trajectory
 from .configfile import configured
 from .discover import discover
+from .edits import NONE, Edits, kept
 from .inputs import Inputs, open_inputs
 
 Final = Literal["none", "batch"]
@@ -42,12 +44,13 @@ def replay(
     settings: Sequence[str] = (),
     final: Final = "none",
     estimator: Estimator = SOLVERS["isam2"],
+    edits: Edits = NONE,
 ) -> "Run":
     """Replay bags, journals or a pose graph. Iterate the Run for its updates, or ask for its `result`.
 
     config: without one, or without sources in it, these are found by the types of the topics. settings: `key=value`, applied
     to what was found. final: `batch` ends at the optimum of the kept factors. estimator: makes the solver that takes the
-    factors. SlamError says what is wrong with the input.
+    factors. edits: what was done to the run before. SlamError says what is wrong with the input.
     """
     paths = [inputs] if isinstance(inputs, Path | str) else list(inputs)
     opened = open_inputs(paths)
@@ -60,7 +63,7 @@ def replay(
             given = {} if config is None else config.model_dump(exclude_unset=True, exclude={"sources"})
             config = config_from({**config_to(found), **given}, "configuration")
         config = configured(config, settings)
-        return Run(opened, config, notes, final, estimator)
+        return Run(opened, config, notes, final, estimator, edits=edits)
     except BaseException:
         opened.close()
         raise
@@ -90,10 +93,12 @@ class Run:
         final: Final = "none",
         estimator: Estimator = SOLVERS["isam2"],
         flush: bool = True,
+        edits: Edits = NONE,
     ) -> None:
-        """flush: at the end of the input all is applied that still waits for its turn."""
+        """flush: at the end of the input all is applied that still waits for its turn. edits: what is left out, and done at the end."""
         self.config, self.notes, self.inputs = config, notes, inputs
-        self._final = final
+        self._final, self.edits = final, Edits(edits.dropped)
+        self._to_do = edits.commands
         self.batch: Solution | None = None
         self.backend = Backend(config, estimator(config, SPACES[config.space]))
         self.decisions = DecisionLog()
@@ -118,6 +123,15 @@ class Run:
         for _ in self._updates:
             pass
         return Result(self)
+
+    def edit(self, asked: Command) -> Iterator[Update]:
+        """At the end of the run: carry a command out, and come to rest as at the end of the input."""
+        before = perf_counter()
+        self.edits = Edits(self.edits.dropped, (*self.edits.commands, asked))
+        yield from self._take(self.backend.add(asked))
+        self._settle()
+        self.__dict__.pop("result", None)
+        self.seconds.solve(perf_counter() - before, 0)
 
     @property
     def online(self) -> Trajectory:
@@ -150,7 +164,8 @@ class Run:
 
     def _stream(self) -> Iterator[Measurement | Decision]:
         with self.inputs:
-            yield from settled_stream(self.inputs.stream(self.config), self.config, self._flush, self._passed)
+            items = kept(self.inputs.stream(self.config), self.edits.dropped)
+            yield from settled_stream(items, self.config, self._flush, self._passed)
 
     def _passed(self, watermark: int) -> None:
         self._watermark = watermark
@@ -186,11 +201,16 @@ class Run:
         if not len(self.backend.timeline):
             raise BadFile(_nothing(self))
         self._online_cost = cost(self.backend.solver.factors.values(), self.backend.estimate.values())
+        self._settle()
+        self.seconds.solve(perf_counter() - before, 0)
+        for asked in self._to_do:
+            yield from self.edit(asked)
+
+    def _settle(self) -> None:
         self.backend.polish()
         if self._final == "batch":
             self.batch = polish(self.backend.solver.factors.values(), self.backend.estimate.values())
             self.backend.adopt(self.batch.values)
-        self.seconds.solve(perf_counter() - before, 0)
 
     def _take(self, updates: Sequence[Update]) -> Iterator[Update]:
         for update in updates:
@@ -285,6 +305,7 @@ class Result:
                 "loops_probation": loops.get("probation", 0),
                 "loops_refused": loops.get("refused", 0) + loops.get("removed", 0),
             },
+            "edits": len(run.edits),
             "decisions": self.decisions.by_rule(),
             "cost": {
                 "initial": cost(self.factors, run.backend.dead_reckoning()),

@@ -4,7 +4,7 @@ import csv
 import json
 import os
 from collections import Counter
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from functools import cached_property
 from io import StringIO
 from pathlib import Path
@@ -22,15 +22,18 @@ from ..core.query import Unknown
 from ..core.space import SPACES, Space
 from ..core.trajectory import Stamps, Trajectory
 from .configfile import load_config, write_yaml
+from .edits import NAME as EDITS
+from .edits import Edits, arrivals, read_edits, write_edits
 from .export import pose_graph
 from .formats import trajectory as forms
 from .formats import tum, write_graph, write_trajectory
 from .formats.lines import read_bytes, read_text
 from .history import NAME as HISTORY
 from .history import Recorded
+from .inputs import open_inputs
 from .linearized import Linearized, write_linearized
 from .past import Past, Then
-from .replay import Result, replay
+from .replay import Final, Result, Run, replay, settled_stream
 
 FILES = ("summary.json", "config.yaml", "trajectory.tum", "odometry.tum", "online.tum", "landmarks.csv",
          "decisions.jsonl", "graph.g2o", "linearized.npz")  # fmt: skip
@@ -64,8 +67,21 @@ def write_run(result: Result, out: Path | str) -> None:
     landmarks = [result.run.backend.landmark(name) for name in snapshot.names]
     write_linearized(out / "linearized.npz", result.factors, result.values, snapshot.indices, landmarks)
     write_yaml(out / "config.yaml", result.run.config)
+    write_edits(out / EDITS, result.run.edits)
     summary = json.dumps(result.summary, indent=1)
     (out / "summary.json").write_text(summary + "\n", encoding="utf-8")
+
+
+def replace_run(out: Path, by: Path) -> None:
+    """Put the files of one run in the place of another's, on the same disk. Its edits come first: with them and the summary, which
+    comes last and names the inputs, a run that was broken off in between can be written again.
+    """
+    names = [name for name in (EDITS, *FILES, *DRAWN) if name != "summary.json"]
+    for name in (*names, "summary.json"):
+        if (by / name).exists():
+            (by / name).replace(out / name)
+        else:
+            (out / name).unlink(missing_ok=True)
 
 
 def prepare(out: Path) -> None:
@@ -83,7 +99,7 @@ def prepare(out: Path) -> None:
 
 def _is_run(out: Path) -> bool:
     """Whether a directory holds nothing but a run, whole or broken off."""
-    known = {*FILES, *DRAWN, *([INPUTS] if all(path.is_symlink() for path in _links(out)) else [])}
+    known = {*FILES, *DRAWN, EDITS, *([INPUTS] if all(path.is_symlink() for path in _links(out)) else [])}
     if any(path.name not in known for path in out.iterdir()):
         return False
     try:
@@ -297,25 +313,51 @@ class FinishedRun:
         return found
 
     @cached_property
-    def _past(self) -> Past:
+    def edits(self) -> Edits:
+        """What was done to it after its end."""
+        return read_edits(self.path / EDITS)
+
+    def again(self, edits: Edits | None = None) -> Run:
+        """A replay of its inputs to the same end; edits: others than its own. BadFile if they are not there any more."""
+        final: Final = "batch" if self.summary.get("batch") else "none"
+        return replay(self._inputs, self.config, final=final, edits=self.edits if edits is None else edits)
+
+    def numbers(self, ids: Collection[str], dropped: Collection[int]) -> dict[str, int]:
+        """Which measurements of the inputs, in order of arrival, have these ids in a run without those that are dropped."""
+        with open_inputs(self._inputs) as inputs:
+            return arrivals(inputs.stream(self.config), self.config, dropped, ids, settled_stream)
+
+    def compare(self, run: Run) -> None:
+        """BadFile where a whole replay took another way than the run itself."""
+        self._alike(run.online, self.online)
+
+    @cached_property
+    def _inputs(self) -> list[Path]:
         estimator = self.summary.get("estimator", "isam2")
         if estimator != "isam2":
             raise BadFile(
-                f"{self.path}: what '{estimator}' believed earlier cannot be asked; only isam2 can be"
+                f"{self.path}: what '{estimator}' believed earlier cannot be asked, nor edited; only isam2 can be"
             )
         paths = [Path(path) for path in self.summary["input"]]
         if gone := [path for path in paths if not path.exists()]:
             raise BadFile(
-                f"{self.path}: what was believed earlier is found by a replay of its inputs, and {gone[0]} is not there; put it back"
+                f"{self.path}: this takes a replay of its inputs, and {gone[0]} is not there; put it back"
             )
-        return Past(lambda: replay(paths, self.config))
+        return paths
+
+    @cached_property
+    def _past(self) -> Past:
+        paths, dropped = self._inputs, Edits(self.edits.dropped)
+        return Past(lambda: replay(paths, self.config, edits=dropped))
 
     def _compare(self, stamp: int) -> None:
         """What the replay believed of each keyframe when it was newest with what the run itself did."""
         again = self._past.run_at(stamp).online
-        first = self._trajectory("online.tum")
-        same = again.stamps.tolist() == first.stamps[: len(again)].tolist()
-        if not same or np.abs(again.sevens - first.sevens[: len(again)]).max(initial=0.0) > ALIKE:
+        self._alike(again, Trajectory(self.online.stamps[: len(again)], self.online.sevens[: len(again)]))
+
+    def _alike(self, again: Trajectory, first: Trajectory) -> None:
+        same = again.stamps.tolist() == first.stamps.tolist()
+        if not same or np.abs(again.sevens - first.sevens).max(initial=0.0) > ALIKE:
             names = ", ".join(self.summary["input"])
             raise BadFile(
                 f"{self.path}: a replay of {names} takes another way: the inputs have changed, or the versions"
