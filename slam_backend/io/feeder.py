@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from itertools import count
 from multiprocessing.resource_tracker import ensure_running
+from pathlib import Path
 from typing import Any
 
 from ..core.config import Config
@@ -30,10 +31,12 @@ LOST = "the worker ended before it answered"
 class _Worker:
     """One process, and how far it has come. quiet_until: the row up to which its reports have been told already."""
 
-    def __init__(self, config: Config, table: Mapping[str, tuple[str, str]], quiet_until: int) -> None:
+    def __init__(
+        self, config: Config, table: Mapping[str, tuple[str, str]], journal: Path, quiet_until: int
+    ) -> None:
         context = multiprocessing.get_context("spawn")  # a forked copy of DDS's threads would deadlock
         self.pipe, theirs = context.Pipe()
-        self.process = context.Process(target=serve, args=(theirs, config, table), daemon=True)
+        self.process = context.Process(target=serve, args=(theirs, config, table, journal), daemon=True)
         with undisturbed():
             self.process.start()
         theirs.close()
@@ -78,7 +81,7 @@ class Feeder:
         self._answered = threading.Condition()
         self._stop = threading.Event()
         self.restarts = 0
-        self._worker = _Worker(config, table, 0)
+        self._worker = _Worker(config, table, journal.path, 0)
         self._thread = threading.Thread(target=self._keep, name="feeder", daemon=True)
         self._thread.start()
 
@@ -179,7 +182,7 @@ class Feeder:
             why = worker.failure or f"it ended with code {worker.process.exitcode}"
             self._died(f"the worker was lost ({why}); another one reads the journal from its start")
             self._stop.wait(min(PATIENCE * 2**deaths, LONGEST_PAUSE) if deaths else 0)
-            self._worker = _Worker(self._config, self._table, self._told_to)
+            self._worker = _Worker(self._config, self._table, self._journal.path, self._told_to)
             if self._stop.is_set():
                 self._worker.end()  # close() may have seen the one before only
 

@@ -81,11 +81,12 @@ class LiveInputs:
     def __init__(
         self,
         pipe: Connection,
+        journal: Path,
         table: Mapping[str, tuple[str, str]],
         idle: Callable[[], None],
         answer: Callable[[Request], Any],
     ) -> None:
-        self.paths = [Path("live")]
+        self.paths = [journal]
         self.count = self.read = self.applied = 0
         self.damage: list[str] = []
         self.last: Request | None = None
@@ -136,9 +137,11 @@ class LiveInputs:
 class _Worker:
     """Runs the stream, reports after each batch of rows, answers requests."""
 
-    def __init__(self, pipe: Connection, config: Config, table: Mapping[str, tuple[str, str]]) -> None:
+    def __init__(
+        self, pipe: Connection, config: Config, table: Mapping[str, tuple[str, str]], journal: Path
+    ) -> None:
         self._pipe = pipe
-        self._inputs = LiveInputs(pipe, table, self._report, self._answer)
+        self._inputs = LiveInputs(pipe, journal, table, self._report, self._answer)
         self._run = Run(self._inputs, config, [])
         self._updates: list[Update] = []
         self._told = 0
@@ -194,13 +197,13 @@ class _Worker:
         return result.summary
 
 
-def serve(pipe: Connection, config: Config, table: Mapping[str, tuple[str, str]]) -> None:
+def serve(pipe: Connection, config: Config, table: Mapping[str, tuple[str, str]], journal: Path) -> None:
     """The process: topic -> (source, kind) in `table`. Ends when asked to finish, or when the node is gone."""
     for wish in (signal.SIGINT, signal.SIGTERM):
         signal.signal(wish, signal.SIG_IGN)  # Ctrl-C is the node's affair: it will ask to finish
     signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT, signal.SIGTERM})
     try:
-        _Worker(pipe, config, table).serve()
+        _Worker(pipe, config, table, journal).serve()
     except BrokenPipeError:
         pass  # the node is gone: nobody to tell
     except Exception as error:  # noqa: BLE001  # a defect: the node says it, and starts another worker

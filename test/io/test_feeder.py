@@ -21,6 +21,7 @@ from slam_backend.io.feeder import Feeder
 from slam_backend.io.inputs import OWN
 from slam_backend.io.journal import Journal
 from slam_backend.io.replay import replay
+from slam_backend.io.rundir import FinishedRun
 from slam_backend.lab.simulate import Options, simulate, write_simulation
 
 POSES = 300
@@ -144,6 +145,7 @@ def test_a_command_is_part_of_what_a_new_worker_reads(stage, drive) -> None:
     assert told["run_hash"] == replay(stage.journal.path, stage.config).result.summary["run_hash"]
     assert told["run_hash"] != summary["run_hash"]
     assert told["decisions"]["command/optimize"] == 1
+    assert FinishedRun(stage.folder / "run").again().result.summary["run_hash"] == told["run_hash"]
     assert [decision.id for decision in stage.decisions].count("command/17") == 1
 
 
