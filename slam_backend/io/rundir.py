@@ -341,7 +341,7 @@ class FinishedRun:
         paths = [Path(path) for path in self.summary["input"]]
         if gone := [path for path in paths if not path.exists()]:
             raise BadFile(
-                f"{self.path}: what was believed earlier, or would be after an edit, is found by a replay of its inputs, and {gone[0]} is not there; put it back"
+                f"{self.path}: what was believed earlier (or would be after an edit) is found by a replay of its inputs, and {gone[0]} is not there; put it back"
             )
         return paths
 
