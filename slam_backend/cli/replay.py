@@ -64,6 +64,12 @@ def command(
             metavar="F", help="Stream to Rerun: a file F.rrd, rerun+http://HOST:PORT/proxy, or spawn."
         ),
     ] = None,
+    continued: Annotated[
+        Path | None,
+        typer.Option(
+            "--continue", metavar="RUN", help="Go on in the map of a finished run, with its configuration."
+        ),
+    ] = None,
     out: Annotated[Path | None, typer.Option(metavar="DIR", help="Default: runs/NAME of the input.")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print the summary as JSON.")] = False,
 ) -> None:
@@ -76,7 +82,11 @@ def command(
     if sweep and rerun:
         raise BadConfig("--rerun: shows one run; leave it out, or --sweep")
     target = out or Path("runs") / inputs[0].stem
-    job = Job(tuple(inputs), config, tuple(settings or ()), final, estimator, bag, report, rerun, target)
+    if continued and target.absolute() == continued.absolute():
+        raise BadConfig(f"--out {target}: is the run that is continued; name another directory")
+    job = Job(
+        tuple(inputs), config, tuple(settings or ()), final, estimator, bag, report, rerun, continued, target
+    )
     if sweep:
         _sweep(job, sweep, as_json)
         return
@@ -99,6 +109,7 @@ class Job:
     bag: "With | None"
     report: bool
     rerun: str | None
+    continued: Path | None
     out: Path
 
 
@@ -113,7 +124,7 @@ def work(job: Job, shown: "Progress") -> "Result":
 
     prepare(job.out)
     config = load_config(job.config) if job.config else None
-    run = replay(job.inputs, config, job.settings, job.final, ESTIMATORS[job.estimator])
+    run = replay(job.inputs, config, job.settings, job.final, ESTIMATORS[job.estimator], job.continued)
     history = History(run)
     viewer = Viewer(run, job.rerun) if job.rerun else None
     watch(run, [history.see, *([viewer.see] if viewer else [])], shown)

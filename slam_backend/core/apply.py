@@ -10,8 +10,9 @@ from .errors import SolverFailure
 from .graph import UNTIL_JOINED, Decision, Delta, Estimate, Factor, Pose, is_pose
 from .measurement import Array
 from .parts import Parts
+from .sessions import SavedMap
 from .solvers import Solver
-from .space import Space
+from .space import Space, value_in
 
 FOUNDATION = frozenset({"gauge", "motion"})  # kinds without which a keyframe cannot be
 
@@ -64,36 +65,76 @@ class Applier:
     def _connects(self, factor: Factor) -> bool:
         if factor.kind == "pose":
             part = self._parts.of(factor.keys[0])
-            return part is not None and self._parts.gauge(part) is not None
+            return part is not None and self._parts.is_loose(part)
         return all(map(is_pose, factor.keys)) and len(self._parts_of(factor)) == 2
 
     def _parts_of(self, factor: Factor) -> set[int]:
         return {part for key in factor.keys if (part := self._parts.of(key)) is not None}
 
     def _connect(self, event: Factor) -> None:
-        loose = [part for part in self._parts_of(event) if self._parts.gauge(part) is not None]
-        delta = Delta((event,))
-        if loose:
-            part = max(loose)
-            gauge = self._parts.gauge(part)
-            assert gauge is not None
-            delta = Delta((event,), (gauge,), self._moved(part, event))
-        if not self._solve(delta):
+        parts = sorted(self._parts_of(event))
+        part = self._loose(parts)
+        values = {} if part is None else self._moved(part, self._shift(part, event))
+        if not self._solve(Delta((event,), self._gauge(part), values)):
             return
-        if event.kind == "pose":
+        if event.kind != "pose":
+            self._merge(parts[0], parts[1])
+            return
+        assert part is not None
+        home = self._parts.home
+        if home is None:
             self._parts.release(part)
-            return
-        kept, gone = sorted(self._parts_of(event))
-        if loose and part == kept:  # the earlier part was moved onto one with absolute measurements
-            self._parts.release(kept)
-        self._parts.merge(kept, gone)
+        else:  # it stands in that map now
+            self._merge(home, part)
+
+    def join(self, first: int, second: int, shift: Pose, factors: tuple[Factor, ...]) -> bool:
+        """Move a part as a whole, and hold it there by factors between it and another one instead of its gauge.
+
+        shift: of the first to where it lies beside the second. False: the solver did not take it.
+        """
+        part = self._loose((first, second))
+        shift = shift if part == first else shift.inverse()
+        values = {} if part is None else self._moved(part, shift)
+        if not self._solve(Delta(factors, self._gauge(part), values)):
+            return False
+        self._merge(first, second)
+        return True
+
+    def load(self, saved: SavedMap) -> None:
+        """Begin with the factors and the estimate of a map."""
+        keys = saved.values.keys()
+        values = {key: value_in(self._space, saved.values, key) for key in keys}
+        delta = Delta(saved.factors, values=values)
+        self.estimate = self._solver.update(delta)
+        gauges = {saved.parts[f.keys[0]]: f.id for f in saved.factors if f.kind == "gauge"}
+        self._parts.restore(saved.parts, gauges)
+        self.sighted |= saved.sighted
+        self._booked(delta)
+
+    def _loose(self, parts: Sequence[int]) -> int | None:
+        """Of these the part to move: the latest that only its gauge holds."""
+        return max((part for part in parts if self._parts.is_loose(part)), default=None)
+
+    def _gauge(self, part: int | None) -> tuple[str, ...]:
+        gauge = None if part is None else self._parts.gauge(part)
+        return () if gauge is None else (gauge,)
+
+    def _merge(self, first: int, second: int) -> None:
+        """What was moved is gone; else what began later."""
+        part = self._loose((first, second))
+        gone = max(first, second) if part is None else part
+        self._parts.merge(first if gone == second else second, gone)
         self._wake(UNTIL_JOINED)
 
-    def _moved(self, part: int, event: Factor) -> dict[int, Any]:
-        """The variables of a part, moved as a whole so that the event's error is zero."""
+    def _shift(self, part: int, event: Factor) -> Pose:
+        """The motion of a part as a whole that makes the event's error zero."""
         assert self.estimate is not None
         poses = [self.estimate.pose(key) for key in event.keys]
-        shift = shift_of(event, poses, last=self._parts.of(event.keys[-1]) == part)
+        return shift_of(event, poses, last=self._parts.of(event.keys[-1]) == part)
+
+    def _moved(self, part: int, shift: Pose) -> dict[int, Any]:
+        """The variables of a part, moved as a whole."""
+        assert self.estimate is not None
         values, space = self.estimate.values(), self._space
         return {
             key: shift.compose(space.pose_in(values, key))

@@ -21,6 +21,7 @@ from .graph import (
     Decision,
     Delta,
     Estimate,
+    Factor,
     Keyframe,
     Offer,
     Pose,
@@ -32,10 +33,12 @@ from .keyframes import Timeline, Track, due
 from .measurement import Array, Measurement, StaticTransform
 from .mounts import Mounts
 from .parts import Parts
+from .reunion import Reunion, reunion
 from .robust import ROBUST, Robust
 from .robust.paths import Paths
 from .sensors import SENSORS
 from .sensors.odometry import OdometryPose
+from .sessions import SavedMap, Tracks, joined
 from .settle import FAR
 from .solvers import SOLVERS, Solver
 from .space import SPACES
@@ -92,6 +95,7 @@ class Backend:
             raise BadConfig(f"source '{second[0]}': a second odometry; '{self._driver}' drives the keyframes")
         self._relative = driving.kind == "relative"
         self.track = Track(space, driving if isinstance(driving, OdometrySource) else OdometrySource())
+        self.tracks = Tracks(self.track)
         self.timeline = Timeline()
         self.parts = Parts()
         self._mounts = Mounts(space, config.base_frame, config.extrinsics)
@@ -107,6 +111,31 @@ class Backend:
             self.solver, space, self._applier, lambda key: self.timeline.keyframes[symbolIndex(key)].stamp
         )
         self._revision = 0
+
+    def load(self, saved: SavedMap) -> None:
+        """Go on in a saved map: what comes is a part of its own, until a measurement joins it to the map. SlamError if it cannot be."""
+        if len(self.timeline):
+            raise SlamError("a map can be loaded only before the first keyframe: reset first")
+        if saved.space != self.space.name:
+            raise SlamError(f"the map was made in space {saved.space}, and this is space {self.space.name}")
+        self._applier.load(saved)
+        for each in saved.keyframes:
+            self.timeline.add(each)
+        self._landmarks |= saved.landmarks
+        noise = self.track.noise
+        self.tracks.before([Track(self.space, noise).restore(each) for each in saved.tracks])
+        self._waiting.remember(factor.id for factor in saved.factors if factor.kind != "gauge")
+        self._growth.begins = saved.end
+        self._revision = saved.revision
+
+    def saved(self, online: Trajectory, run_hash: str = "") -> SavedMap:
+        """What another session needs to go on from here. online: what was believed of each keyframe when it was newest."""
+        keyframes = tuple(self.timeline.keyframes)
+        return SavedMap(
+            self.space.name, tuple(self.solver.factors.values()), self.estimate.values(), keyframes,
+            dict(self._landmarks), dict(self.parts.all()), dict(self._applier.sighted),
+            tuple(track.samples() for track in self.tracks if len(track)), online, self._revision, run_hash,
+        )  # fmt: skip
 
     def add(self, measurement: Measurement) -> list[Update]:
         """Take the next measurement; return an update for each keyframe that it made."""
@@ -174,11 +203,16 @@ class Backend:
         points = np.zeros((len(names), 3))
         for row, name in zip(points, names, strict=True):
             row[: self.space.point_dimension] = self.space.point_in(values, self._landmarks[name])
-        odometry = self.track.trajectory()
+        rows = {each.stamp: row for row, each in enumerate(keyframes)}
+        sessions = [(track, rows[first.stamp]) for track, first in self.tracks.starts(keyframes)]
+        odometry = joined(
+            [track.trajectory().from_start(sevens[row], keyframes[row].stamp) for track, row in sessions]
+            or [self.track.trajectory()]
+        )
         return Snapshot(
-            Trajectory(stamps, sevens),
+            Trajectory(stamps, sevens, stamps[[row for _, row in sessions[1:]]]),
             np.array([k.index for k in keyframes], dtype=np.int64),
-            odometry.from_start(sevens[0], keyframes[0].stamp) if keyframes else odometry,
+            odometry,
             names,
             points,
             self._revision,
@@ -188,9 +222,11 @@ class Backend:
         """Where everything would be by odometry alone, landmarks where their first sighting puts them."""
         values = gtsam.Values()
         keyframes = self.timeline.in_order()
-        start = self.estimate.pose(keyframes[0].pose).compose(self.track.pose(keyframes[0].stamp).inverse())
-        for each in keyframes:
-            values.insert(each.pose, start.compose(self.track.pose(each.stamp)))
+        for track, first in self.tracks.starts(keyframes):
+            start = self.estimate.pose(first.pose).compose(track.pose(first.stamp).inverse())
+            for each in keyframes:
+                if track.covers(each.stamp):
+                    values.insert(each.pose, start.compose(track.pose(each.stamp)))
         for key, (pose_key, point) in self._applier.sighted.items():
             values.insert(key, self.space.pose_in(values, pose_key).transformFrom(point))
         return values
@@ -283,7 +319,7 @@ class Backend:
             self._applier.estimate,
             guesses,
             self._mounts,
-            lambda stamp: self.timeline.place(stamp, self.track, self.space),
+            lambda stamp: self.timeline.place(stamp, self.tracks.of(stamp) or self.track, self.space),
             self.track.motion,
             self.landmark,
             self.parts.of,
@@ -336,9 +372,35 @@ class Backend:
             if self._robust:
                 late = {key: guess for key, guess in delta.values.items() if key not in sure.values}
                 self._judge(Delta(judged, values=late))
+            self._reunite()
         except SolverFailure:
             self._give_up(delta, new, window)
         return [self._told(b, delta.values.get(b.pose))] if self.timeline.at(b.stamp) is b else []
+
+    def _reunite(self) -> None:
+        """Join parts that have come to know enough of the same landmarks."""
+        while waits := self._waiting.for_a_joint():
+            found = reunion(self.space, waits, self.estimate, self.parts.of)
+            if found is None or not self._applier.join(
+                found.part, found.to, found.shift, self._common(found)
+            ):
+                return
+
+    def _common(self, found: Reunion) -> tuple[Factor, ...]:
+        """The factors of the sightings that join two parts."""
+        self._waiting.used(found.waits)
+        by_source: dict[str, list[Offer]] = defaultdict(list)
+        for wait in found.waits:
+            by_source[wait.offer.measurement.source].append(wait.offer)
+        context = replace(self._context({}), component=lambda _: found.to)
+        deltas = [
+            SENSORS["landmark"].factors(
+                offers, None, self.timeline.keyframes[-1], context, self.config.sources[name]
+            )
+            for name, offers in by_source.items()
+        ]
+        self._decisions += [decision for delta in deltas for decision in delta.decisions]
+        return tuple(factor for delta in deltas for factor in delta.add)
 
     def _judge(self, proposed: Delta) -> None:
         self._editor.offered(proposed.add)

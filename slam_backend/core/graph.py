@@ -73,6 +73,16 @@ class Wait:
     offer: Offer
     until: int  # key; UNTIL_JOINED: until two components become one
     reason: str
+    seen: "Seen | None" = None  # what it would say about how the two components lie
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Seen:
+    """A landmark of one component, seen from a pose of another: where, from that pose."""
+
+    pose: int
+    landmark: int
+    point: Array
 
 
 @dataclass(frozen=True, slots=True)

@@ -29,6 +29,7 @@ class Growth:
 
     def __init__(self, space: Space, timeline: Timeline, track: Track, parts: Parts) -> None:
         self._space, self._timeline, self._track, self._parts = space, timeline, track, parts
+        self.begins = 0  # the newest stamp of earlier sessions, whose keyframes are complete
 
     def start(self, stamp: int) -> tuple[Keyframe, Delta]:
         """A part of its own: its first pose is the origin, until something absolute says otherwise."""
@@ -53,30 +54,41 @@ class Growth:
         grown: list[Delta] = []
         guesses: dict[int, Any] = {}
         marked: list[Offer] = []
-        at = self._timeline.at
         while edges:
-            n = next(
-                (n for n, (_, m, _) in enumerate(edges) if any(at(stamp) for stamp in m.ends or ())), None
-            )
+            n = next((n for n, (_, m, _) in enumerate(edges) if any(map(self._present, m.ends or ()))), None)
             offer = edges.pop(n or 0)
             m = offer.measurement
             assert isinstance(m, RelativePose)
             context = context_of(guesses)
             try:
-                step = relative.step(m, context)
+                step = self._step(m, context)
             except Unusable as why:
                 grown.append(Delta(decisions=(refusal(offer, "relative", why.reason, why.detail),)))
                 continue
-            if n is None:
-                grown.append(self._root(m.stamp_i))
+            new = [stamp for stamp in m.ends if self._timeline.at(stamp) is None]
+            if n is None and new:
+                grown.append(self._root(new[0]))
                 guesses.update(grown[-1].values)
-            i, j = at(m.stamp_i), at(m.stamp_j)
-            if i is not None and j is None:
+            i, j = self._present(m.stamp_i), self._present(m.stamp_j)
+            left = [stamp for stamp in new if self._timeline.at(stamp) is None]
+            if i is not None and m.stamp_j in left:
                 guesses.update(self._branch(i, m.stamp_j, step, context))
-            elif j is not None and i is None:
+            elif j is not None and m.stamp_i in left:
                 guesses.update(self._branch(j, m.stamp_i, step.inverse(), context))
-            marked.append(offer._replace(motion=i is None or j is None))
+            marked.append(offer._replace(motion=bool(left)))
         return total(grown) + Delta(values=guesses), marked
+
+    def _present(self, stamp: int) -> Keyframe | None:
+        """The keyframe with that stamp, if it is one of this session."""
+        return self._timeline.at(stamp) if self._track.covers(stamp) else None
+
+    def _step(self, m: RelativePose, context: Context) -> Pose:
+        for stamp in m.ends:
+            if stamp <= self.begins and self._timeline.at(stamp) is None:
+                raise Unusable(
+                    "overlap", "one of its ends lies in the map that is continued, and is no keyframe of it"
+                )
+        return relative.step(m, context)
 
     def _root(self, stamp: int) -> Delta:
         _, delta = self.start(stamp)

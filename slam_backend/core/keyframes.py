@@ -18,9 +18,18 @@ from .config import Keyframes, OdometrySource
 from .graph import Keyframe, Motion, Pose
 from .measurement import SECOND, Array
 from .space import Space, interpolate
-from .trajectory import Trajectory
+from .trajectory import Stamps, Trajectory
 
 SAMPLES_PER_STEP = 32  # odometry samples kept between two keyframes; a parked robot must not fill the memory
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Samples:
+    """Of a track. stamps: (N,) ns. numbers: (N, k) poses as `Space.numbers`. covariances: (N, d, d), or none."""
+
+    stamps: Stamps
+    numbers: Array
+    covariances: Array
 
 
 class Track:
@@ -35,7 +44,7 @@ class Track:
     """
 
     def __init__(self, space: Space, noise: OdometrySource) -> None:
-        self._space, self._noise = space, noise
+        self._space, self.noise = space, noise
         self._stamps = array("q")
         self._numbers: list[tuple[float, ...]] = []
         self._covariances: list[Array] = []  # per sample; only for noise `twist` (of the step) and `pose`
@@ -52,7 +61,7 @@ class Track:
         at = len(self._stamps)
         if at and stamp < self._stamps[-1]:
             at = bisect_left(self._stamps, stamp)
-        if at and covariance is not None and self._noise.noise == "twist":
+        if at and covariance is not None and self.noise.noise == "twist":
             covariance = self._filled(covariance, self._sample(at - 1).between(pose))
         self._protected += at <= self._protected < len(self._stamps)
         self._stamps.insert(at, stamp)
@@ -74,6 +83,19 @@ class Track:
         strand = stamp if stamp == beside else self._strands.get(beside)
         if strand is not None:
             self._strands[stamp] = strand
+
+    def samples(self) -> Samples:
+        return Samples(
+            np.array(self._stamps, dtype=np.int64), np.array(self._numbers), np.array(self._covariances)
+        )
+
+    def restore(self, samples: Samples) -> "Track":
+        """Take over the samples of a track that is finished."""
+        self._stamps = array("q", samples.stamps.tolist())
+        self._numbers = [tuple(row) for row in samples.numbers.tolist()]
+        self._covariances = list(samples.covariances)
+        self.protect()
+        return self
 
     def covers(self, stamp: int) -> bool:
         if not self._stamps or not self._stamps[0] <= stamp <= self._stamps[-1]:
@@ -118,23 +140,23 @@ class Track:
         return self._space.pose_of_numbers(self._numbers[index])
 
     def _covariance(self, start: int, end: int, motion: Pose, last: Pose) -> Array:
-        if self._noise.noise == "twist" and self._covariances:
+        if self.noise.noise == "twist" and self._covariances:
             return self._floor() + self._of_twists(start, end, last)
-        if self._noise.noise == "pose" and self._covariances:
+        if self.noise.noise == "pose" and self._covariances:
             grown = self._of_poses(start, end, motion)
             if grown is not None:
                 return self._floor() + grown
-        return self._floor() + growth(self._space, self._noise, motion)
+        return self._floor() + growth(self._space, self.noise, motion)
 
     def _floor(self) -> Array:
-        noise = self._noise
+        noise = self.noise
         return self._space.diagonal(noise.sigma_rotation_floor**2, noise.sigma_translation_floor**2)
 
     def _filled(self, step: Array, motion: Pose) -> Array:
         """The covariance of a step with the model's growth where a variance is zero."""
         unknown = np.diag(step) <= 0
         return (
-            step + np.diag(unknown * np.diag(growth(self._space, self._noise, motion)))
+            step + np.diag(unknown * np.diag(growth(self._space, self.noise, motion)))
             if unknown.any()
             else step
         )
@@ -168,7 +190,7 @@ class Track:
     def _thin(self) -> None:
         """Drop every second sample of the current step; step covariances are handed to the next sample."""
         drop = range(self._protected + 1, len(self._stamps) - 1, 2)
-        if self._covariances and self._noise.noise == "twist":
+        if self._covariances and self.noise.noise == "twist":
             for i in drop:
                 adjoint = self._sample(i + 1).between(self._sample(i)).AdjointMap()
                 self._covariances[i + 1] = (
@@ -236,12 +258,13 @@ class Timeline:
     def place(self, stamp: int, track: Track, space: Space) -> Placed | None:
         """The nearest keyframe (by distance moved, then by time) with the motion to the stamp.
 
-        None when the stamp lies outside the keyframes or the track does not cover it.
+        None when the stamp does not lie between two keyframes that the track covers.
         """
         if exact := self._by_stamp.get(stamp):
             return Placed(exact, None)
         right = bisect_left(self._stamps, stamp)
-        if right in (0, len(self._stamps)) or not track.covers(stamp):
+        beside = self._stamps[max(right - 1, 0) : right + 1]
+        if len(beside) < 2 or not all(map(track.covers, beside)):
             return None
         here = track.pose(stamp)
 
@@ -249,7 +272,7 @@ class Timeline:
             meters, radians = space.size(track.pose(near).between(here))
             return meters, radians, abs(stamp - near)
 
-        nearest = min(self._stamps[right - 1 : right + 1], key=distance)
+        nearest = min(beside, key=distance)
         return Placed(self._by_stamp[nearest], track.motion(nearest, stamp))
 
 

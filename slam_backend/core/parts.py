@@ -1,6 +1,6 @@
 """Connected parts of the graph: each has one gauge, until an absolute pose or a joint to another part replaces it."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 
 class Parts:
@@ -8,6 +8,7 @@ class Parts:
         self._of: dict[int, int] = {}
         self._members: dict[int, list[int]] = {}
         self._gauges: dict[int, str] = {}
+        self.home: int | None = None  # the part that is the map to others: it is not moved, whatever holds it
 
     def __len__(self) -> int:
         return len(self._members)
@@ -26,6 +27,22 @@ class Parts:
     def gauge(self, part: int) -> str | None:
         """Id of the factor that fixes the part in space; None when absolute measurements do."""
         return self._gauges.get(part)
+
+    def is_loose(self, part: int) -> bool:
+        """Whether the part may be moved as a whole: only its gauge holds it."""
+        return part in self._gauges and part != self.home
+
+    def restore(self, parts: Mapping[int, int], gauges: Mapping[int, str]) -> None:
+        """Take over the parts of a saved map, by variable, and their gauges. The one that began first is the map."""
+        for key, part in parts.items():
+            self._of[key] = part
+            self._members.setdefault(part, []).append(key)
+        self._gauges |= gauges
+        self.home = min(self._members)
+
+    def all(self) -> Mapping[int, int]:
+        """Variable -> its part."""
+        return self._of
 
     def begin(self, key: int, gauge: str) -> None:
         """A new part with one variable, numbered by it: parts that begin earlier have smaller numbers."""
@@ -57,9 +74,11 @@ class Parts:
 
     def become(self, other: "Parts") -> None:
         """The parts of a graph that has been put together anew."""
-        vars(self).update(vars(other))
+        home = None if self.home is None else other.of(self.home)
+        vars(self).update({**vars(other), "home": home})
 
     def merge(self, kept: int, gone: int) -> None:
+        """The gauge of the part that is gone holds nothing any more."""
         for key in self._members[gone]:
             self._of[key] = kept
         self._members[kept] += self._members.pop(gone)

@@ -204,6 +204,8 @@ def _stamp(moment: Moment, known: Known) -> int:
         return int(stamps[rows[0]])
     first, last = int(stamps[0]), int(stamps[-1])
     stamp = last if moment.stamp is None else moment.stamp
+    if known.trajectory.between_sessions(np.array([stamp]))[0]:
+        raise Unknown(f"{format_stamp(stamp)} lies between two sessions")
     if not first <= stamp <= last:
         span = f"{format_stamp(first)} to {format_stamp(last)}"
         raise Unknown(f"{format_stamp(stamp)} lies outside the trajectory, {span}")

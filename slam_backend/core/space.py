@@ -14,7 +14,7 @@ import gtsam
 import numpy as np
 
 from .geometry import covariance_from_ros, covariance_to_ros, seven_of_matrix
-from .graph import Pose
+from .graph import Pose, is_pose
 from .measurement import Array
 
 ZENITH = 1e-3  # least change of direction per radian of azimuth, which has no effect straight up
@@ -32,6 +32,10 @@ class Space(Protocol):
     def pose(self, seven: Sequence[float]) -> Pose: ...
 
     def from_extrinsics(self, six: Sequence[float]) -> Pose: ...
+
+    def rigid(self, rotation: Array, translation: Array) -> Pose:
+        """From a rotation matrix and a vector of this space's points."""
+        ...
 
     def seven(self, pose: Pose) -> tuple[float, ...]: ...
 
@@ -104,6 +108,11 @@ class Space(Protocol):
         ...
 
 
+def value_in(space: Space, values: gtsam.Values, key: int) -> Any:
+    """Pose or point, by its key."""
+    return space.pose_in(values, key) if is_pose(key) else space.point_in(values, key)
+
+
 def interpolate(space: Space, start: Pose, end: Pose, ratio: float) -> Pose:
     """The pose at `ratio` of the way, along the constant twist from start to end."""
     return start.compose(space.expmap(ratio * space.logmap(start.between(end))))
@@ -124,6 +133,9 @@ class Planar:
 
     def from_extrinsics(self, six: Sequence[float]) -> Pose:
         return gtsam.Pose2(six[0], six[1], six[5])
+
+    def rigid(self, rotation: Array, translation: Array) -> Pose:
+        return gtsam.Pose2(gtsam.Rot2.fromCosSin(rotation[0, 0], rotation[1, 0]), translation)
 
     def seven(self, pose: Pose) -> tuple[float, ...]:
         half = pose.theta() / 2
@@ -232,6 +244,9 @@ class Spatial:
     def from_extrinsics(self, six: Sequence[float]) -> Pose:
         x, y, z, roll, pitch, yaw = six
         return gtsam.Pose3(gtsam.Rot3.RzRyRx(roll, pitch, yaw), np.array((x, y, z)))
+
+    def rigid(self, rotation: Array, translation: Array) -> Pose:
+        return gtsam.Pose3(gtsam.Rot3(rotation), translation)
 
     def seven(self, pose: Pose) -> tuple[float, ...]:
         q = pose.rotation().toQuaternion()

@@ -1,6 +1,6 @@
 """Poses at any stamp, and the state of the back-end as plain arrays."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -13,10 +13,14 @@ Stamps = NDArray[np.int64]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Trajectory:
-    """`map_T_base` over time. stamps: (N,) ns, strictly increasing. sevens: (N, 7) x y z qx qy qz qw."""
+    """`map_T_base` over time. stamps: (N,) ns, strictly increasing. sevens: (N, 7) x y z qx qy qz qw.
+
+    breaks: stamps at which another session begins: nothing is known between the pose before and that one.
+    """
 
     stamps: Stamps
     sevens: Array
+    breaks: Stamps = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
 
     def __len__(self) -> int:
         return len(self.stamps)
@@ -29,15 +33,24 @@ class Trajectory:
     def at(self, stamps: ArrayLike) -> Array:
         """(M, 7) interpolated at (M,) ns: positions linearly, rotations along great circles (slerp, Shoemake 1985).
 
-        Rows of NaN outside the trajectory.
+        Rows of NaN outside the trajectory, and between sessions.
         """
         wanted = np.asarray(stamps, dtype=np.int64)
         result = np.full((len(wanted), 7), np.nan)
         if len(self):
             right = np.searchsorted(self.stamps, wanted)
-            covered = (self.stamps[0] <= wanted) & (right < len(self))
+            covered = (self.stamps[0] <= wanted) & (right < len(self)) & ~self.between_sessions(wanted)
             result[covered] = _sampled(self, wanted[covered], right[covered]).T
         return result
+
+    def between_sessions(self, stamps: Stamps) -> NDArray[np.bool_]:
+        """(M,) whether a stamp lies after the end of one session and before the start of the next."""
+        rows = np.searchsorted(self.stamps, self.breaks)
+        ends, n = self.stamps[rows - 1], np.searchsorted(self.breaks, stamps, side="right")
+        found = np.zeros(len(stamps), dtype=np.bool_)
+        inside = np.flatnonzero(n < len(self.breaks))
+        found[inside] = stamps[inside] > ends[n[inside]]
+        return found
 
     def from_start(self, start: Array, stamp: int | None = None) -> "Trajectory":
         """The same motion, moved as a whole so that its pose at `stamp` (none: its first) is `start` (7,)."""
@@ -52,10 +65,13 @@ def shaped(keyframes: Trajectory, odometry: Trajectory, stamps: ArrayLike) -> Ar
         X(t) = X_a (O_a^-1 O(t)) Exp(s Log((O_a^-1 O_b)^-1 X_a^-1 X_b)),   s the share of the time from a to b
 
     The keyframes themselves are met to the bit. Where the odometry does not cover the stretch, or has no sample inside
-    it and so no shape, plain interpolation (`Trajectory.at`). Rows of NaN outside the keyframes.
+    it and so no shape, plain interpolation (`Trajectory.at`). Rows of NaN outside the keyframes, and between sessions.
     """
     wanted = np.asarray(stamps, dtype=np.int64)
     rows, right, begins, ends = _with_shape(keyframes.stamps, odometry.stamps, wanted)
+    if len(keyframes.breaks):
+        known = ~keyframes.between_sessions(wanted[rows])
+        rows, right, begins, ends = (each[known] for each in (rows, right, begins, ends))
     plain = np.ones(len(wanted), dtype=np.bool_)
     plain[rows] = False
     result = np.empty((len(wanted), 7))

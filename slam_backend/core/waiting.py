@@ -1,15 +1,15 @@
 """Measurements on their way: for a keyframe that covers them, or for a variable that they need."""
 
 from collections import Counter, defaultdict
-from collections.abc import Callable
+from collections.abc import Callable, Collection, Iterable
 from heapq import heappop, heappush
 from itertools import islice
 
 from .config import Config
 from .errors import BadConfig
 from .firewall.rules import MOST_WAITING, decided
-from .graph import Decision, Offer, Wait, identify
-from .measurement import Measurement
+from .graph import UNTIL_JOINED, Decision, Offer, Wait, identify
+from .measurement import Measurement, parse_stamp
 
 
 class Waiting:
@@ -95,6 +95,23 @@ class Waiting:
     def wake(self, key: int) -> None:
         """A variable exists now, or parts were joined: what waited for it is offered again."""
         self._pending += [wait.offer for wait in self._undetermined.pop(key, ())]
+
+    def for_a_joint(self) -> list[Wait]:
+        """What waits until two parts become one."""
+        return self._undetermined.get(UNTIL_JOINED, [])
+
+    def used(self, waits: Collection[Wait]) -> None:
+        """They wait no longer for a joint."""
+        left = [wait for wait in self.for_a_joint() if wait not in waits]
+        self._undetermined[UNTIL_JOINED] = left
+
+    def remember(self, ids: Iterable[str]) -> None:
+        """Ids that are taken: what is offered later gets others."""
+        for id_ in ids:
+            source, stamp, n = id_.split("/")
+            counts = self._counts[source]
+            stamp_ns = parse_stamp(stamp)
+            counts[stamp_ns] = max(counts.get(stamp_ns, -1), int(n))
 
     def leftovers(self) -> list[Decision]:
         """At the end of the input: refuse what no keyframe ever covered, and what waited in vain."""

@@ -18,19 +18,21 @@ from ..core.check import checked, rechecked
 from ..core.command import Command
 from ..core.config import Config, config_from, config_hash, config_to
 from ..core.decisions import DecisionLog
-from ..core.errors import BadFile
+from ..core.errors import BadFile, SlamError
 from ..core.fingerprint import run_hash
 from ..core.graph import Decision, Factor
-from ..core.measurement import SECOND, Measurement, StaticTransform
+from ..core.measurement import SECOND, Measurement, StaticTransform, format_stamp
+from ..core.sessions import SavedMap
 from ..core.settle import FAR, settled
 from ..core.solvers import SOLVERS, Solver
 from ..core.solvers.batch import Solution, polish
 from ..core.space import SPACES, Space
 from ..core.trajectory import Snapshot, Trajectory
-from .configfile import configured
+from .configfile import configured, load_config
 from .discover import discover
 from .edits import NONE, Edits, kept
-from .inputs import Inputs, open_inputs
+from .inputs import GraphInput, Inputs, open_inputs
+from .mapfile import read_map
 
 Final = Literal["none", "batch"]
 Estimator = Callable[[Config, Space], Solver]
@@ -45,14 +47,19 @@ def replay(
     final: Final = "none",
     estimator: Estimator = SOLVERS["isam2"],
     edits: Edits = NONE,
+    continued: Path | None = None,
 ) -> "Run":
     """Replay bags, journals or a pose graph. Iterate the Run for its updates, or ask for its `result`.
 
     config: without one, or without sources in it, these are found by the types of the topics. settings: `key=value`, applied
     to what was found. final: `batch` ends at the optimum of the kept factors. estimator: makes the solver that takes the
-    factors. edits: what was done to the run before. SlamError says what is wrong with the input.
+    factors. edits: what was done to the run before. continued: a run directory, whose map the inputs go on in; its
+    configuration serves if none is given. SlamError says what is wrong with the input.
     """
     paths = [inputs] if isinstance(inputs, Path | str) else list(inputs)
+    saved = None if continued is None else read_map(continued)
+    if continued is not None and (config is None or not config.sources):
+        config = load_config(continued / "config.yaml")
     opened = open_inputs(paths)
     notes: list[str] = []
     try:
@@ -63,10 +70,13 @@ def replay(
             given = {} if config is None else config.model_dump(exclude_unset=True, exclude={"sources"})
             config = config_from({**config_to(found), **given}, "configuration")
         config = configured(config, settings)
-        return Run(opened, config, notes, final, estimator, edits=edits)
+        run = Run(opened, config, notes, final, estimator, edits=edits)
+        if continued is not None and saved is not None:
+            run.load(continued, saved)
     except BaseException:
         opened.close()
         raise
+    return run
 
 
 def settled_stream(
@@ -104,6 +114,8 @@ class Run:
         self.decisions = DecisionLog()
         self.seconds = Seconds()
         self.measurements = 0
+        self.continued: Path | None = None  # the run whose map this one goes on in
+        self._begins = 0  # what drives must be later
         self.last: Update | None = None
         self.reached = 0  # the newest stamp that has been applied
         self._watermark = -FAR
@@ -116,6 +128,21 @@ class Run:
 
     def __iter__(self) -> Iterator[Update]:
         return self._updates
+
+    def load(self, run: Path, saved: SavedMap) -> None:
+        """Go on in the map of a finished run. SlamError if that cannot be."""
+        if isinstance(self.inputs, GraphInput):
+            raise BadFile(
+                f"{self.inputs.paths[0]}: a pose graph has no stamps of its own, and cannot continue a map"
+            )
+        try:
+            self.backend.load(saved)
+        except SlamError as error:
+            raise BadFile(f"{run}: {error}") from None
+        self.continued, self._begins = run, saved.end
+        self._online += zip(
+            saved.online.stamps.tolist(), map(tuple, saved.online.sevens.tolist()), strict=True
+        )
 
     @cached_property
     def result(self) -> "Result":
@@ -182,6 +209,8 @@ class Run:
                 self.decisions.add(item)
             elif item.stamp > until and not isinstance(item, StaticTransform):
                 return
+            elif item.stamp <= self._begins and item.source == self.config.driver:
+                self.decisions.add(_overlapping(item, self._begins))
             else:
                 yield from self._apply(item)
             self._ahead = None
@@ -198,7 +227,7 @@ class Run:
     def _finish(self) -> Iterator[Update]:
         before = perf_counter()
         yield from self._take(self.backend.finish())
-        if not len(self.backend.timeline):
+        if self.last is None:
             raise BadFile(_nothing(self))
         self._online_cost = cost(self.backend.solver.factors.values(), self.backend.estimate.values())
         self._settle()
@@ -288,6 +317,10 @@ class Result:
         """What summary.json holds."""
         run, loops = self.run, self.decisions.loops()
         return {
+            "continued": None if run.continued is None else str(run.continued.absolute()),
+            "sessions": [
+                format_stamp(int(s)) for s in (*self.trajectory.stamps[:1], *self.trajectory.breaks)
+            ],
             "input": [str(path.absolute()) for path in run.inputs.paths],
             "run_hash": run_hash(self.factors, self.decisions, self.values, self.trajectory.sevens),
             "config_hash": config_hash(run.config),
@@ -319,6 +352,13 @@ class Result:
             "damage": run.inputs.damage,
             "notes": run.notes,
         }
+
+
+def _overlapping(item: Measurement, end: int) -> Decision:
+    return Decision(
+        item.stamp, f"{item.source}/{format_stamp(item.stamp)}", item.source, "refused", "session", "overlap",
+        f"a new session must be later than the map that it continues, which ends at {format_stamp(end)}", ends=item.ends,
+    )  # fmt: skip
 
 
 def cost(factors: Iterable[Factor], values: gtsam.Values) -> float:
@@ -366,7 +406,10 @@ def _nothing(run: Run) -> str:
     """Why there is no trajectory, in one line."""
     driver = run.config.driver
     refused = {rule: n for rule, n in run.decisions.by_rule().items() if n}
+    overlap = next((f"; {d.detail}" for d in run.decisions if d.reason == "overlap"), "")
     why = ", ".join(f"{rule} {n}" for rule, n in refused.items()) or "it holds none"
     damage = "; ".join(run.inputs.damage)
     where = ", ".join(str(path) for path in run.inputs.paths)
-    return f"{where}: not one usable message of source '{driver}' ({why})" + (f"; {damage}" if damage else "")
+    return f"{where}: not one usable message of source '{driver}' ({why}){overlap}" + (
+        f"; {damage}" if damage else ""
+    )

@@ -17,7 +17,7 @@ from ..core.decisions import as_json
 from ..core.difference import Difference
 from ..core.errors import BadConfig, BadFile, SlamError
 from ..core.graph import Decision
-from ..core.measurement import Array, format_stamp
+from ..core.measurement import Array, format_stamp, parse_stamp
 from ..core.query import Unknown
 from ..core.space import SPACES, Space
 from ..core.trajectory import Stamps, Trajectory
@@ -32,11 +32,13 @@ from .history import NAME as HISTORY
 from .history import Recorded
 from .inputs import open_inputs
 from .linearized import Linearized, write_linearized
+from .mapfile import NAME as MAP
+from .mapfile import write_map
 from .past import Past, Then
 from .replay import Final, Result, Run, replay, settled_stream
 
 FILES = ("summary.json", "config.yaml", "trajectory.tum", "odometry.tum", "online.tum", "landmarks.csv",
-         "decisions.jsonl", "graph.g2o", "linearized.npz")  # fmt: skip
+         "decisions.jsonl", "graph.g2o", "linearized.npz", MAP)  # fmt: skip
 
 
 ALIKE = 1e-6  # m and of quaternions; between replays on different machines
@@ -68,6 +70,7 @@ def write_run(result: Result, out: Path | str) -> None:
     write_linearized(out / "linearized.npz", result.factors, result.values, snapshot.indices, landmarks)
     write_yaml(out / "config.yaml", result.run.config)
     write_edits(out / EDITS, result.run.edits)
+    write_map(out / MAP, result.run.backend.saved(result.run.online, result.summary["run_hash"]))
     summary = json.dumps(result.summary, indent=1)
     (out / "summary.json").write_text(summary + "\n", encoding="utf-8")
 
@@ -210,7 +213,10 @@ class FinishedRun:
     def trajectory(self) -> Trajectory:
         found = self._trajectory("trajectory.tum")
         self._counted("trajectory.tum", len(found), self._keyframes)
-        return found
+        begins = self.summary.get("sessions", [])[1:]
+        return Trajectory(
+            found.stamps, found.sevens, np.array([parse_stamp(b) for b in begins], dtype=np.int64)
+        )
 
     @cached_property
     def odometry(self) -> Trajectory:
@@ -297,6 +303,8 @@ class FinishedRun:
 
     def past(self, stamp: int) -> Then:
         """By a replay of the run's inputs. BadFile if they are not there, or not those of the run any more."""
+        if (earlier := self._earlier(stamp)) is not None:
+            return earlier.past(stamp)
         then = self._past.at(stamp)
         self._compare(stamp)
         return then
@@ -305,12 +313,24 @@ class FinishedRun:
         """What changed from one stamp to another, found in the same way. BadConfig where the run never was."""
         if last < first:
             raise BadConfig(f"--to {format_stamp(last)} lies before --from {format_stamp(first)}")
+        if (earlier := self._earlier(first)) is not None:
+            if self._earlier(last) is None:
+                raise BadConfig(
+                    f"--from {format_stamp(first)} lies in an earlier session than --to; ask {earlier.path}"
+                )
+            return earlier.between(first, last)
         try:
             found = self._past.between(first, last)
         except Unknown as why:
             raise BadConfig(f"{self.path}: {why}") from None
         self._compare(last)
         return found
+
+    def _earlier(self, stamp: int) -> "FinishedRun | None":
+        """The run that this one continues, where the stamp lies before this one's first."""
+        breaks = self.trajectory.breaks
+        earlier = self._continued
+        return FinishedRun(earlier) if earlier is not None and stamp < breaks[-1] else None
 
     @cached_property
     def edits(self) -> Edits:
@@ -320,7 +340,8 @@ class FinishedRun:
     def again(self, edits: Edits | None = None) -> Run:
         """A replay of its inputs to the same end; edits: others than its own. BadFile if they are not there any more."""
         final: Final = "batch" if self.summary.get("batch") else "none"
-        return replay(self._inputs, self.config, final=final, edits=self.edits if edits is None else edits)
+        done = self.edits if edits is None else edits
+        return replay(self._inputs, self.config, final=final, edits=done, continued=self._continued)
 
     def numbers(self, ids: Collection[str], dropped: Collection[int]) -> dict[str, int]:
         """Which measurements of the inputs, in order of arrival, have these ids in a run without those that are dropped."""
@@ -345,10 +366,16 @@ class FinishedRun:
             )
         return paths
 
+    @property
+    def _continued(self) -> Path | None:
+        """The run whose map it goes on in."""
+        continued = self.summary.get("continued")
+        return None if continued is None else Path(continued)
+
     @cached_property
     def _past(self) -> Past:
         paths, dropped = self._inputs, Edits(self.edits.dropped)
-        return Past(lambda: replay(paths, self.config, edits=dropped))
+        return Past(lambda: replay(paths, self.config, edits=dropped, continued=self._continued))
 
     def _compare(self, stamp: int) -> None:
         """What the replay believed of each keyframe when it was newest with what the run itself did."""

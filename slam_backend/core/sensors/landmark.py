@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from ..config import LandmarkSource
 from ..context import Context, Unusable, defaulted, each
 from ..errors import BadMessage
-from ..graph import UNTIL_JOINED, Delta, Factor, Keyframe, Motion, Offer, Pose, Wait
+from ..graph import UNTIL_JOINED, Delta, Factor, Keyframe, Motion, Offer, Pose, Seen, Wait
 from ..keyframes import Placed
 from ..measurement import Array, Decoder, Measurement, Message, frozen, parse_frame, stamp_of
 from ..robust.kernels import noise_of
@@ -126,11 +126,13 @@ def _sight(offer: Offer, context: Context, config: LandmarkSource, points: dict[
     placed, mount = context.landing(m.stamp), context.mount(m.frame)
     key, pose_key, space = context.landmark(m.landmark), placed.keyframe.pose, context.space
     known = key in points or context.component(key) is not None
-    if key not in points and known and context.component(key) != context.component(pose_key):
-        return Wait(
-            offer, UNTIL_JOINED, "the landmark belongs to a part of the graph that is not connected yet"
-        )
     value, covariance = _in_space(m, space, config)
+    if key not in points and known and context.component(key) != context.component(pose_key):
+        why, seen = "the landmark belongs to a part of the graph that is not connected yet", None
+        if m.form != "bearing":
+            _, _, point = _polar(m.form, (value, covariance), mount, placed.motion, space)
+            seen = Seen(pose_key, key, point)
+        return Wait(offer, UNTIL_JOINED, why, seen)
     if m.form == "bearing":
         if not known:
             return Wait(offer, key, "a bearing alone cannot place a landmark")
