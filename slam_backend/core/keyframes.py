@@ -25,11 +25,15 @@ SAMPLES_PER_STEP = 32  # odometry samples kept between two keyframes; a parked r
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Samples:
-    """Of a track. stamps: (N,) ns. numbers: (N, k) poses as `Space.numbers`. covariances: (N, d, d), or none."""
+    """Of a track. stamps: (N,) ns. numbers: (N, k) poses as `Space.numbers`. covariances: (N, d, d), or none.
+
+    strands: (N,) which samples share a frame: -1 with the first ones, else the strand's number.
+    """
 
     stamps: Stamps
     numbers: Array
     covariances: Array
+    strands: Stamps
 
 
 class Track:
@@ -85,15 +89,17 @@ class Track:
             self._strands[stamp] = strand
 
     def samples(self) -> Samples:
-        return Samples(
-            np.array(self._stamps, dtype=np.int64), np.array(self._numbers), np.array(self._covariances)
-        )
+        stamps = np.array(self._stamps, dtype=np.int64)
+        strands = np.array([self._strands.get(stamp, -1) for stamp in stamps.tolist()], dtype=np.int64)
+        return Samples(stamps, np.array(self._numbers), np.array(self._covariances), strands)
 
     def restore(self, samples: Samples) -> "Track":
         """Take over the samples of a track that is finished."""
         self._stamps = array("q", samples.stamps.tolist())
         self._numbers = [tuple(row) for row in samples.numbers.tolist()]
         self._covariances = list(samples.covariances)
+        strands = zip(samples.stamps.tolist(), samples.strands.tolist(), strict=True)
+        self._strands = {stamp: strand for stamp, strand in strands if strand >= 0}
         self.protect()
         return self
 
@@ -264,7 +270,7 @@ class Timeline:
             return Placed(exact, None)
         right = bisect_left(self._stamps, stamp)
         beside = self._stamps[max(right - 1, 0) : right + 1]
-        if len(beside) < 2 or not all(map(track.covers, beside)):
+        if len(beside) < 2 or not all(map(track.covers, (stamp, *beside))):
             return None
         here = track.pose(stamp)
 

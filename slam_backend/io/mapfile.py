@@ -7,7 +7,7 @@
     names, name_keys                (L,) of the landmarks
     keys, parts                     (V,) the component of each variable
     seen, seen_from, seen_at        (S,) landmarks, the pose that saw each first, and where from there (S, 2 or 3)
-    track_sizes, track_stamps, track_numbers, track_covariances    the odometry of each session, one after the other
+    track_sizes, track_stamps, track_numbers, track_strands, track_covariances    the odometry of each session, one after the other
     online_stamps, online_sevens    what was believed of each keyframe when it was newest
 
 graph.g2o cannot serve: it has no gauges, kernels, ids, bearings. gtsam's own text keeps every number to the bit.
@@ -53,6 +53,7 @@ def write_map(path: Path, saved: SavedMap) -> None:
         track_sizes=_integers(len(track.stamps) for track in saved.tracks),
         track_stamps=np.concatenate([track.stamps for track in saved.tracks]),
         track_numbers=np.concatenate([track.numbers for track in saved.tracks]),
+        track_strands=np.concatenate([track.strands for track in saved.tracks]),
         track_covariances=_covariances(saved.tracks),
         online_stamps=saved.online.stamps, online_sevens=saved.online.sevens,
     )  # fmt: skip
@@ -122,10 +123,12 @@ def _map(arrays: dict[str, Any]) -> SavedMap:
 
 def _tracks(arrays: dict[str, Any]) -> tuple[Samples, ...]:
     ends = np.cumsum(arrays["track_sizes"])[:-1]
-    stamps, numbers = (np.split(arrays[f"track_{name}"], ends) for name in ("stamps", "numbers"))
+    stamps, numbers, strands = (
+        np.split(arrays[f"track_{name}"], ends) for name in ("stamps", "numbers", "strands")
+    )
     covariances = arrays["track_covariances"]
     each = np.split(covariances, ends) if len(covariances) else [covariances] * len(stamps)
-    return tuple(Samples(*parts) for parts in zip(stamps, numbers, each, strict=True))
+    return tuple(Samples(*parts) for parts in zip(stamps, numbers, each, strands, strict=True))
 
 
 def _covariances(tracks: tuple[Samples, ...]) -> Any:
