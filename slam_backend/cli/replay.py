@@ -124,7 +124,9 @@ def work(job: Job, shown: "Progress") -> "Result":
 
     prepare(job.out)
     config = load_config(job.config) if job.config else None
-    run = replay(job.inputs, config, job.settings, job.final, ESTIMATORS[job.estimator], job.continued)
+    run = replay(
+        job.inputs, config, job.settings, job.final, ESTIMATORS[job.estimator], continued=job.continued
+    )
     history = History(run)
     viewer = Viewer(run, job.rerun) if job.rerun else None
     watch(run, [history.see, *([viewer.see] if viewer else [])], shown)
