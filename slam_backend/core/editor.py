@@ -69,10 +69,12 @@ class Editor:
         self._solver, self._space, self._applier = solver, space, applier
         self._stamp_of = stamp_of
         self._history = History()
-        self._known: dict[
-            str, Factor
-        ] = {}  # as they were made: what stages judge, and what a person has edited
+        # without weights: what stages judge, and what a person has edited
+        self._known: dict[str, Factor] = {}
         self._said: dict[str, Verdict] = {}  # of those: the last verdict that was not a person's
+        self._wanted: dict[
+            str, bool
+        ] = {}  # of those: whether it would be in the graph without a person's wish
 
     @property
     def wishes(self) -> Wishes:
@@ -93,8 +95,9 @@ class Editor:
         plan = self.plan(command.action, command.arguments)
         before, held = self._history.now, dict(self._solver.factors)
         estimate = self._solver.restart(plan.graph.factors, plan.solution.values)
-        for id_ in plan.history.now.ids - self._known.keys():
-            self._known[id_] = held[id_]
+        for id_ in plan.history.now.ids - before.ids:
+            self._wanted[id_] = id_ in held
+            self._known[id_] = held[id_] if id_ in held else self._known[id_]
         self._history = plan.history
         now = self._solver.factors
         added = [factor for id_, factor in now.items() if held.get(id_) is not factor]
@@ -144,17 +147,15 @@ class Editor:
         passed: by id, why a factor may enter, told where it does not either.
         """
         wishes, held = self._history.now, self._solver.factors
+        self._known.update((factor.id, factor) for factor in delta.add)  # as a stage may have made it anew
+        self._wanted |= {factor.id: True for factor in delta.add} | dict.fromkeys(delta.remove, False)
         overruled = {f.id: f for f in delta.add if f.id in wishes.out or f.id in held}
         stays = [id_ for id_ in delta.remove if id_ in wishes.forced or id_ not in held]
         decisions = []
         for id_, factor in overruled.items():
-            self._said[id_] = "accepted"
             decisions += [passed[id_]] if id_ in passed else []
             decisions.append(self._decision(factor, "edited"))
-        for id_ in stays:
-            self._said[id_] = "removed"
-            if id_ in self._known:
-                decisions.append(self._decision(self._known[id_], "edited"))
+        decisions += [self._decision(self._known[id_], "edited") for id_ in stays if id_ in self._known]
         add = tuple(weighted(f, wishes.weights.get(f.id, 1.0)) for f in delta.add if f.id not in overruled)
         remove = tuple(id_ for id_ in delta.remove if id_ not in stays)
         return replace(delta, add=add, remove=remove), decisions
@@ -174,9 +175,9 @@ class Editor:
         kept = [factor for factor in held.values() if factor.kind != "gauge" and factor.id not in edited]
         fresh: list[Factor] = []
         for id_ in sorted(edited):
-            original = self._known.get(id_) or held[id_]
             if self._enters(id_, wishes):
-                (kept if id_ in held else fresh).append(weighted(original, wishes.weights.get(id_, 1.0)))
+                factor = weighted(self._original(id_), wishes.weights.get(id_, 1.0))
+                (kept if id_ in held else fresh).append(factor)
         gauges = [factor for factor in held.values() if factor.kind == "gauge"]
         graph = assembled(self._space, kept, fresh, gauges, before, self._applier.sighted, self._stamp_of)
         near = reason == "optimized"
@@ -199,15 +200,22 @@ class Editor:
         return Plan(history, graph, solution, reason, told, shift.noticeable if near else True)
 
     def _enters(self, id_: str, wishes: Wishes) -> bool:
-        return id_ not in wishes.out and (id_ in wishes.forced or self._said.get(id_) not in OUT)
+        if id_ in wishes.out or id_ in wishes.forced:
+            return id_ not in wishes.out
+        return self._wanted[id_] if id_ in self._history.now.ids else id_ in self._solver.factors
+
+    def _original(self, id_: str) -> Factor:
+        """Without a weight."""
+        held = self._solver.factors
+        return self._known[id_] if id_ in self._history.now.ids or id_ not in held else held[id_]
 
     def _decision(self, factor: Factor, reason: str, command: Command | None = None) -> Decision:
         """What holds for a factor by what a person wishes, or, where that has been taken back, by what others said last."""
         out, forced, weight = self._history.now.of(factor.id)
-        verdict: Verdict = "removed" if out else "restored"
-        if not out and not forced:
-            said = self._said.get(factor.id, "restored")
-            verdict = said if said in OUT else "restored"
+        verdict: Verdict = "restored"
+        if out or not (forced or self._wanted[factor.id]):
+            said = self._said.get(factor.id)
+            verdict = said if said is not None and said in OUT and not out else "removed"
         why = out or ("forced" if forced else "reweighted" if weight != 1.0 else reason)
         return Decision(
             factor.stamp, factor.id, factor.source, verdict, "edit", why,

@@ -11,6 +11,7 @@ from slam_backend.core.config import config_from
 from slam_backend.core.errors import SlamError
 from slam_backend.core.graph import Decision, Delta
 from slam_backend.core.measurement import SECOND
+from slam_backend.core.robust import ROBUST
 from slam_backend.core.sensors.landmark import LandmarkObservation
 from slam_backend.core.sensors.pose import AbsolutePose
 from slam_backend.core.solvers.batch import solve
@@ -319,6 +320,36 @@ def test_what_is_disabled_stays_out_whatever_a_stage_says(doubted):
     assert [d.verdict for u in updates for d in u.decisions if d.id == FIRST] == ["accepted", "removed"]
     asked(backend, "undo")
     assert FIRST in backend.solver.factors  # what the stage said meanwhile counts
+
+
+@pytest.mark.parametrize("stage", ROBUST)
+def test_a_wish_holds_beside_every_stage_until_it_is_taken_back(stage, wrong):
+    """A true loop kept out and a wrong one forced in, in the midst of the drive; both stay so to its end, and may then go."""
+    backend = Backend(config_from({"robust": [stage]}))
+    updates = [update for item in wrong[:-2] for update in backend.add(item)]
+    edit = {"disable": [FIRST], "enable": [WRONG], "reweight": {SECOND_LOOP: 0.5}}
+    updates += backend.add(command("1", "edit", edit))
+    assert updates[-1].decisions[-1].verdict == "accepted"
+    updates += [update for item in wrong[-2:] for update in backend.add(item)] + backend.finish()
+    assert FIRST not in backend.solver.factors
+    assert WRONG in backend.solver.factors
+    assert [last(updates, id_).verdict for id_ in (FIRST, WRONG)] == ["removed", "restored"]
+    *_, decision = asked(backend, "undo")
+    assert decision.verdict == "accepted"
+    assert np.isfinite(poses(backend)).all()
+
+
+def test_undo_brings_a_loop_back_as_the_stage_had_made_it(laps):
+    """With the kernel that the stage has put around its noise, though its verdict was that it weighs little."""
+    backend = Backend(config_from({"robust": ["switchable"]}))
+    for item in laps:
+        backend.add(item)
+    backend.finish()
+    whole = dict(backend.solver.factors)
+    asked(backend, disable=["relative"])
+    assert len(backend.solver.factors) == len(whole) - 4
+    asked(backend, "undo")
+    assert backend.solver.factors == whole
 
 
 def test_a_dry_run_that_cannot_be_says_why(laps):
