@@ -524,7 +524,7 @@ def test_answers_come_while_the_worker_does_not(warehouse) -> None:
         asking = warehouse.begin("query", GetParameters.Request(names=["pose@k5#cov"]), GetParameters)
         times = seconds_of(lambda: warehouse.query("pose@k5"), 50)
         assert np.array_equal(warehouse.query("pose@k5")[0], known)
-        assert times[25] < 0.02
+        assert times[25] < 1  # and not the half minute that a worker may take
         assert len(warehouse.trajectory()[0])
         assert not saving.done()
         assert not asking.done()
