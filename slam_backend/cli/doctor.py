@@ -30,10 +30,11 @@ def command(
 
     The rules, what they compare and what to do about them: docs/firewall.md.
     """
-    from ..io.configfile import load_config
+    from ..io.configfile import blaming, load_config
     from ..io.doctor import examine
 
-    checkup = examine(inputs, load_config(config) if config else None)
+    with blaming(config):
+        checkup = examine(inputs, load_config(config) if config else None)
     typer.echo(json.dumps(_plain(checkup)) if as_json else "\n".join(_lines(checkup)))
     if checkup.serious:
         raise typer.Exit(1)

@@ -115,7 +115,7 @@ class Job:
 
 def work(job: Job, shown: "Progress") -> "Result":
     """Replay, and write the run directory."""
-    from ..io.configfile import load_config
+    from ..io.configfile import blaming, load_config
     from ..io.history import History
     from ..io.replay import replay
     from ..io.rundir import prepare
@@ -123,13 +123,14 @@ def work(job: Job, shown: "Progress") -> "Result":
     from ..lab.viewer import Viewer
 
     prepare(job.out)
-    config = load_config(job.config) if job.config else None
-    run = replay(
-        job.inputs, config, job.settings, job.final, ESTIMATORS[job.estimator], continued=job.continued
-    )
-    history = History(run)
-    viewer = Viewer(run, job.rerun) if job.rerun else None
-    watch(run, [history.see, *([viewer.see] if viewer else [])], shown)
+    with blaming(job.config):
+        config = load_config(job.config) if job.config else None
+        run = replay(
+            job.inputs, config, job.settings, job.final, ESTIMATORS[job.estimator], continued=job.continued
+        )
+        history = History(run)
+        viewer = Viewer(run, job.rerun) if job.rerun else None
+        watch(run, [history.see, *([viewer.see] if viewer else [])], shown)
     write(run.result, history, job.out, job.report, job.bag)
     if viewer:
         viewer.finish()

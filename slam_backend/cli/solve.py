@@ -76,6 +76,7 @@ def command(
         found = optimum(problem, request, advance)
     said = {"graph": str(graph), "method": method, "robust": robust, **_said(problem, found)}
     said["convention"] = _convention(graph, pose_graph.space, rotation_information)
+    said["out"] = None if out is None else str(out)
     said["not_written"] = write(problem.solved(found.solution.values), rotation_information)
     typer.echo(json.dumps(said) if as_json else "\n  ".join(_lines(said)))
 
@@ -124,6 +125,8 @@ def _lines(said: dict[str, Any]) -> list[str]:
         ("left_out", "not used"),
         ("not_written", "not in the written file"),
     )
+    if said["out"]:
+        lines.append(f"written: {said['out']}")
     lines += [f"{what}: {_some(said[key])}" for key, what in named if said[key]]
     if said["robust"] == "gnc":
         lines.append(f"wrong loops: {_some(['-'.join(ends) for ends in said['refused']]) or 'none'}")

@@ -10,7 +10,8 @@ In YAML the sources are named in a list and described at the top level, so that 
 
 import hashlib
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from difflib import get_close_matches
 from typing import Annotated, Any, Literal, get_args
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
@@ -19,6 +20,8 @@ from pydantic.fields import FieldInfo
 from .errors import BadConfig
 
 LIVE: dict[str, Any] = {"live": True}  # settings that a running node takes; all others are read-only there
+
+MOST_TOLD = 3  # mistakes in one line
 
 KernelName = Literal["none", "huber", "cauchy", "tukey", "geman_mcclure", "dcs"]
 StageName = Literal["gate", "witness", "pcm", "gnc", "switchable", "max_mixture", "rrr"]
@@ -349,14 +352,17 @@ def config_from(data: Mapping[str, Any], origin: str = "config") -> Config:
         if len(set(listed)) < len(listed):
             raise BadConfig(f"{origin}: 'sources' names {max(listed, key=listed.count)!r} twice")
         if missing := [name for name in listed if name not in flat]:
+            described = [name for name in flat if name not in Config.model_fields and name not in listed]
+            close = get_close_matches(missing[0], described, n=1)
+            add = f"did you mean '{close[0]}'?" if close else f"add '{missing[0]}: {{kind: ...}}'"
             raise BadConfig(
-                f"{origin}: source '{missing[0]}' is listed in 'sources' but not described: add '{missing[0]}: {{kind: ...}}'"
+                f"{origin}: source '{missing[0]}' is listed in 'sources' but not described: {add}"
             )
         flat["sources"] = {name: flat.pop(name) for name in listed}
     try:
         return Config.model_validate(flat)
     except ValidationError as error:
-        raise BadConfig(f"{origin}: {_first_line(error)}") from None
+        raise BadConfig(f"{origin}: {_told(error, flat)}") from None
 
 
 def config_to(config: Config) -> dict[str, Any]:
@@ -376,8 +382,18 @@ def config_hash(config: Config) -> str:
     return hashlib.sha256(json.dumps(config_to(config), sort_keys=True).encode()).hexdigest()
 
 
-def _first_line(error: ValidationError) -> str:
-    first = error.errors(include_url=False)[0]
+def _told(error: ValidationError, data: Mapping[str, Any]) -> str:
+    """The first few mistakes in one line."""
+    errors = error.errors(include_url=False)
+    sources = data.get("sources")
+    names = list(sources) if isinstance(sources, Mapping) else []
+    lines = [_one_told(each, names) for each in errors[:MOST_TOLD]]
+    more = len(errors) - len(lines)
+    return "; ".join(lines) + (f"; and {more} more" if more else "")
+
+
+def _one_told(first: Any, names: Sequence[str]) -> str:
+    """One mistake. names: of the sources."""
     parts = [str(part) for part in first["loc"]]
     if parts[:1] == ["sources"]:
         parts = [*parts[1:2], *parts[3:]]  # as in the file: without 'sources' and the kind
@@ -388,23 +404,20 @@ def _first_line(error: ValidationError) -> str:
     if first["type"] == "union_tag_not_found":
         what = "is a source, and does not say its kind: add kind: odometry, relative, landmark or pose"
     if first["type"] == "extra_forbidden":
-        what = f"there is no such setting{_suggest(first['loc'])}"
-    more = error.error_count() - 1
+        what = f"there is no such setting{_suggest(first['loc'], names)}"
     value = first.get("input")
     said = (
         f" (it says {value!r})"
         if isinstance(value, (str, int, float, bool)) and first["type"] != "extra_forbidden"
         else ""
     )
-    return f"{where}: {what}{said}" + (f"; and {more} more" if more else "")
+    return f"{where}: {what}{said}"
 
 
-def _suggest(location: tuple[int | str, ...]) -> str:
-    """`; did you mean '...'?` for a misspelt key, from the settings of the section it stands in."""
-    from difflib import get_close_matches
-
+def _suggest(location: tuple[int | str, ...], names: Sequence[str]) -> str:
+    """`; did you mean '...'?` for a misspelt key, from the settings of the section it stands in and, at the top, the sources."""
     *path, key = [str(part) for part in location]
-    known: set[str] = set(Config.model_fields)
+    known: set[str] = {*Config.model_fields, *names}
     if path[:1] == ["sources"]:
         kinds: dict[str, type[Section]] = {
             "odometry": OdometrySource,

@@ -1,6 +1,7 @@
 """The configuration as a YAML file, and settings from the command line."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
@@ -9,6 +10,7 @@ import yaml
 
 from ..core.config import Config, config_from, config_to
 from ..core.errors import BadConfig
+from .formats.lines import reason_of
 
 
 def load_config(path: Path | str, settings: Iterable[str] = ()) -> Config:
@@ -24,9 +26,9 @@ def configured(config: Config, settings: Iterable[str]) -> Config:
 
 def read_yaml(path: Path) -> dict[str, Any]:
     try:
-        data = yaml.safe_load(path.read_text(encoding="utf-8"))
+        data = yaml.load(path.read_text(encoding="utf-8"), _Loader)  # noqa: S506  # a SafeLoader
     except OSError as error:
-        raise BadConfig(f"{path}: cannot be read: {error.strerror}{_nearby(path)}") from None
+        raise BadConfig(f"{path}: cannot be read: {reason_of(error)}{_nearby(path)}") from None
     except UnicodeDecodeError:
         raise BadConfig(f"{path}: is not a text file") from None
     except yaml.YAMLError as error:
@@ -38,6 +40,32 @@ def read_yaml(path: Path) -> dict[str, Any]:
     if not isinstance(data, Mapping):
         raise BadConfig(f"{path}: holds no settings (a list or a plain value instead of 'name: value' lines)")
     return dict(data)
+
+
+@contextmanager
+def blaming(path: Path | None) -> Iterator[None]:
+    """What a configuration asks for in vain is said with the name of its file."""
+    try:
+        yield
+    except BadConfig as error:
+        if path is None or str(path) in str(error):
+            raise
+        raise BadConfig(f"{path}: {error}") from None
+
+
+class _Loader(yaml.SafeLoader):
+    """YAML forbids a key that stands twice; PyYAML takes the last and says nothing."""
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
+        lines: dict[str, int] = {}
+        for key, _ in node.value:
+            if isinstance(key, yaml.ScalarNode) and key.value != "<<":
+                here = key.start_mark.line + 1
+                if key.value in lines:
+                    what = f"'{key.value}' stands here a second time; the first is in line {lines[key.value]}: keep one"
+                    raise yaml.constructor.ConstructorError(None, None, what, key.start_mark)
+                lines[key.value] = here
+        return super().construct_mapping(node, deep)
 
 
 def write_yaml(path: Path, config: Config) -> None:

@@ -37,6 +37,7 @@ from .mapfile import write_map
 from .past import Past, Then
 from .replay import Final, Result, Run, replay, settled_stream
 
+AGAIN = "replay again"  # what to do about a run that is not whole any more
 FILES = ("summary.json", "config.yaml", "trajectory.tum", "odometry.tum", "online.tum", "landmarks.csv",
          "decisions.jsonl", "graph.g2o", "linearized.npz", MAP)  # fmt: skip
 
@@ -185,11 +186,14 @@ class FinishedRun:
             self.summary: dict[str, Any] = json.loads(read_text(path / "summary.json"))
             self._keyframes = int(self.summary["counts"]["keyframes"])
             self._landmarks = int(self.summary["counts"]["landmarks"])
+            self._decided = sum(self.summary.get("decisions", {}).values())
         except json.JSONDecodeError as error:
-            raise BadFile(f"{path / 'summary.json'}:{error.lineno}: is damaged: {error.msg}") from None
-        except (KeyError, TypeError, ValueError):
             raise BadFile(
-                f"{path / 'summary.json'}: is damaged: it does not count keyframes and landmarks"
+                f"{path / 'summary.json'}:{error.lineno}: is damaged: {error.msg}; {AGAIN}"
+            ) from None
+        except (KeyError, TypeError, ValueError, AttributeError):
+            raise BadFile(
+                f"{path / 'summary.json'}: is damaged: it does not count keyframes, landmarks and decisions; {AGAIN}"
             ) from None
 
     @cached_property
@@ -223,7 +227,7 @@ class FinishedRun:
         found, known = self._trajectory("odometry.tum"), self.trajectory.stamps
         if found.stamps[0] > known[0] or found.stamps[-1] < known[-1]:
             raise BadFile(
-                f"{self.path / 'odometry.tum'}: is damaged: it does not reach from the first keyframe to the last"
+                f"{self.path / 'odometry.tum'}: is damaged: it does not reach from the first keyframe to the last; {AGAIN}"
             )
         return found
 
@@ -243,11 +247,16 @@ class FinishedRun:
         path = self.path / "decisions.jsonl"
         lines = read_bytes(path).split(b"\n")
         if lines[-1]:
-            raise BadFile(f"{path}:{len(lines)}: is damaged: the line does not end")
-        try:
-            return [json.loads(line) for line in lines[:-1]]
-        except ValueError:
-            raise BadFile(f"{path}: is damaged: a line is no JSON") from None
+            raise BadFile(f"{path}:{len(lines)}: is damaged: the line does not end; {AGAIN}")
+        found: list[Mapping[str, Any]] = []
+        for number, line in enumerate(lines[:-1], start=1):
+            try:
+                found.append(dict(json.loads(line)))
+            except (ValueError, TypeError):
+                raise BadFile(f"{path}:{number}: is damaged: no JSON object; {AGAIN}") from None
+        if (told := sum(line.get("count", 1) for line in found)) < self._decided:
+            self._counted(path.name, told, self._decided)
+        return found
 
     @cached_property
     def linearized(self) -> Linearized:
@@ -278,7 +287,7 @@ class FinishedRun:
             next(reader)
             found = {row[0]: np.array(row[2:11], dtype=np.float64).reshape(9) for row in reader}
         except (csv.Error, ValueError, IndexError):
-            raise BadFile(f"{path}:{reader.line_num}: is damaged: no name and position") from None
+            raise BadFile(f"{path}:{reader.line_num}: is damaged: no name and position; {AGAIN}") from None
         self._counted(path.name, len(found), self._landmarks)
         return found
 
@@ -287,19 +296,7 @@ class FinishedRun:
 
     def decision(self, identifier: str) -> Mapping[str, Any] | None:
         """The last line of decisions.jsonl about it."""
-        path, needle = self.path / "decisions.jsonl", json.dumps(identifier).encode()
-        lines = read_bytes(path).split(b"\n")
-        if lines[-1]:
-            raise BadFile(f"{path}:{len(lines)}: is damaged: the line does not end")
-        for number in range(len(lines), 0, -1):
-            if needle in lines[number - 1]:
-                try:
-                    line: Any = json.loads(lines[number - 1])
-                except ValueError:
-                    raise BadFile(f"{path}:{number}: is damaged: no JSON") from None
-                if isinstance(line, dict) and line.get("id") == identifier:
-                    return dict(line)
-        return None
+        return next((line for line in reversed(self.decisions) if line.get("id") == identifier), None)
 
     def past(self, stamp: int) -> Then:
         """By a replay of the run's inputs. BadFile if they are not there, or not those of the run any more."""
@@ -393,14 +390,14 @@ class FinishedRun:
     def _counted(self, name: str, found: int, counted: int) -> None:
         if found != counted:
             raise BadFile(
-                f"{self.path / name}: is damaged: it holds {found} where summary.json counts {counted}"
+                f"{self.path / name}: is damaged: it holds {found} where summary.json counts {counted}; {AGAIN}"
             )
 
     def _trajectory(self, name: str) -> Trajectory:
         found = tum.read(self.path / name)
         if (back := np.flatnonzero(np.diff(found.stamps) <= 0)).size:
             raise BadFile(
-                f"{self.path / name}: is damaged: pose {back[0] + 2} is not later than the one before"
+                f"{self.path / name}: is damaged: pose {back[0] + 2} is not later than the one before; {AGAIN}"
             )
         sevens = found.sevens.copy()
         sevens[:, 3:] /= np.linalg.norm(sevens[:, 3:], axis=1, keepdims=True)

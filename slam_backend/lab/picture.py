@@ -1,10 +1,10 @@
 """The first thing to look at: the path before and after, landmarks and loops, to scale."""
 
+import logging
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import matplotlib as mpl
 import numpy as np
 
 from ..core.graph import Decision
@@ -14,15 +14,13 @@ from ..io.replay import Result
 from .colours import LANDMARK, LOOP, ODOMETRY, REFUSED, SMOOTHED
 
 PICTURE = "trajectory.png"
-mpl.use("Agg")  # no screen is needed
 
 LAID_FLAT = 0.02  # share of the largest extent below which height is not worth a view of its own
 
 
 def draw(result: Result, path: Path) -> None:
     """Write a picture: left odometry alone, right the smoothed trajectory over it. Axes in metres, equal."""
-    import matplotlib.pyplot as plt
-
+    plt = _pyplot()
     snapshot = result.snapshot
     views = _views(snapshot.trajectory.sevens[:, :3])
     figure, grid = plt.subplots(len(views), 2, figsize=(14, 6.5 * len(views)), squeeze=False)
@@ -49,6 +47,17 @@ def draw(result: Result, path: Path) -> None:
     figure.tight_layout()
     figure.savefig(path, dpi=110)
     plt.close(figure)
+
+
+def _pyplot() -> Any:
+    """Without a screen, and without a word about a home directory that cannot be written."""
+    logging.getLogger("matplotlib").setLevel(logging.ERROR)
+    import matplotlib as mpl
+
+    mpl.use("Agg")
+    import matplotlib.pyplot as plt
+
+    return plt
 
 
 def _views(positions: Array) -> list[tuple[list[int], str]]:

@@ -236,6 +236,32 @@ def test_an_unknown_data_set_is_the_users_mistake(capsys: pytest.CaptureFixture[
     assert list(tmp_path.iterdir()) == []
 
 
+def test_a_file_is_not_converted_onto_itself(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    graph, text = tmp_path / "a.g2o", "EDGE_SE2 0 1 1 0 0 1 0 0 1 0 1\n"
+    graph.write_text(text)
+    assert cli.main(["convert", str(graph), str(tmp_path / "." / "a.g2o")]) == 2
+    assert "is the input itself" in capsys.readouterr().err
+    assert graph.read_text() == text
+
+
+def test_a_missing_file_comes_with_a_hint(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    assert cli.main(["solve", str(tmp_path / "missing.g2o")]) == 2
+    assert capsys.readouterr().err.endswith("No such file or directory; check the path\n")
+    assert cli.main(["solve", str(tmp_path)]) == 2
+    assert capsys.readouterr().err.endswith("Is a directory; name a file in it\n")
+
+
+def test_solve_says_what_it_wrote_and_when_a_file_may_have_been_cut(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    graph, out = tmp_path / "a.g2o", tmp_path / "b.g2o"
+    graph.write_text("EDGE_SE2 0 1 1 0 0 1 0 0 1 0 12")
+    assert cli.main(["solve", str(graph), "--out", str(out)]) == 0
+    said = capsys.readouterr().out
+    assert f"written: {out}" in said
+    assert "line 1 ends without a line feed" in said
+
+
 def test_a_converted_graph_says_what_became_of_it(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     graph, out = tmp_path / "two.g2o", tmp_path / "two.toro"
     graph.write_text("VERTEX_SE2 0 0 0 0\nVERTEX_SE2 1 1 0 0\nEDGE_SE2 0 1 1 0 0 100 0 0 100 0 400\n")

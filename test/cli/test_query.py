@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from slam_backend import cli
+from slam_backend.core.errors import BadFile
 from slam_backend.core.geometry import seven_of_matrix
 from slam_backend.core.graph import Factor, keyframe
 from slam_backend.core.measurement import SECOND, Array, format_stamp
@@ -124,6 +125,18 @@ def test_the_last_decision_about_a_factor_holds(drive: tuple[Result, Path], tmp_
         file.write(json.dumps({"id": "loops/7.0/01", "detail": "as loops/7.0/0"}) + "\n")
     assert FinishedRun(run).decision("loops/7.0/0") == {"id": "loops/7.0/0", "verdict": "restored"}
     assert FinishedRun(run).decision("loops/7.0") is None
+
+
+def test_decisions_that_were_shortened_are_damage_and_not_silence(
+    drive: tuple[Result, Path], tmp_path: Path
+) -> None:
+    run = shutil.copytree(drive[1], tmp_path / "run")
+    lines = (run / "decisions.jsonl").read_text().splitlines(keepends=True)
+    (run / "decisions.jsonl").write_text("".join(lines[: len(lines) // 2]))
+    with pytest.raises(
+        BadFile, match=r"decisions.jsonl: is damaged: it holds \d+ where .* counts \d+; replay again"
+    ):
+        FinishedRun(run).decision("loops/1.0/0")
 
 
 def test_people_read_one_line_for_each_name(

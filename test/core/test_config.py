@@ -106,9 +106,23 @@ def wheels(**settings) -> dict:
     return {"sources": ["wheels"], "wheels": {"kind": "odometry", **settings}}
 
 
+def test_up_to_three_mistakes_are_named_and_the_rest_counted():
+    text = complaint({f"nonsense{n}": 1 for n in range(5)})
+    assert [f"nonsense{n}: there is no such setting" in text for n in range(5)] == [
+        True,
+        True,
+        True,
+        False,
+        False,
+    ]
+    assert text.endswith("; and 2 more")
+
+
 @pytest.mark.parametrize(
     ("data", "said"),
     [
+        ({**wheels(), "wheel": {"kind": "landmark"}}, ["did you mean 'wheels'?"]),
+        ({"sources": ["wheels"], "whels": {"kind": "odometry"}}, ["not described", "did you mean 'whels'?"]),
         ({"keyframe": {}}, ["keyframe:", "did you mean 'keyframes'?"]),
         ({"settle": {"lagg": 1}}, ["settle.lagg:", "did you mean 'lag'?"]),
         ({"settle": {"xyzzy": 1}}, ["settle.xyzzy:", "known: ahead, lag"]),
@@ -134,7 +148,7 @@ def test_a_misspelt_key_is_named_with_its_place_and_the_right_spelling(data, sai
         ({"extrinsics": {"cam": [1, 2, 3]}}, ["extrinsics.cam.3:"]),
         ({"extrinsics": {"cam": [1, 2, 3, 0, 0, float("inf")]}}, ["extrinsics.cam.5:", "finite"]),
         ({"settle": 3}, ["settle:"]),
-        (wheels(max_speed=-1, noise=3), ["and 1 more"]),
+        (wheels(max_speed=-1, noise=3), ["wheels.noise", "; wheels.max_speed"]),
     ],
 )
 def test_a_wrong_value_is_named_with_its_place_and_what_it_said(data, said):

@@ -1,10 +1,12 @@
 """Configuration files: what they say is what runs; what they get wrong is said in one line with its place."""
 
+from pathlib import Path
+
 import pytest
 
 from slam_backend.core.config import Config, config_from
 from slam_backend.core.errors import BadConfig
-from slam_backend.io.configfile import configured, load_config, override, write_yaml
+from slam_backend.io.configfile import blaming, configured, load_config, override, write_yaml
 
 GOOD = """
 space: 2d
@@ -54,7 +56,7 @@ def test_a_parameter_file_of_the_node_is_taken_as_well(yaml):
     [
         ("keyframe: {distance: 1}", ["keyframe", "did you mean 'keyframes'?"]),
         ("keyframes: {distanse: 1}", ["keyframes.distanse", "did you mean 'distance'?"]),
-        (GOOD + "  # \ntres: 1\n", ["tres", "there is no such setting", "known: ", "space"]),
+        (GOOD + "  # \nqqq: 1\n", ["qqq", "there is no such setting", "known: ", "space"]),
         (GOOD.replace("topic: /odom", "topik: /odom"), ["wheels", "topik", "did you mean 'topic'?"]),
         (GOOD.replace("kind: odometry", "kind: odometer"), ["wheels", "odometer", "'odometry'"]),
         (GOOD.replace("cauchy", "couchy"), ["trees", "kernel", "couchy", "'cauchy'"]),
@@ -118,3 +120,26 @@ def test_override_leaves_what_it_was_given():
     data = {"keyframes": {"distance": 1}}
     override(data, ["keyframes.distance=2"])
     assert data["keyframes"] == {"distance": 1}
+
+
+def test_a_key_that_stands_twice_is_named_with_both_lines(tmp_path):
+    """YAML forbids it; the second would win without a word."""
+    path = tmp_path / "twice.yaml"
+    path.write_text("space: 2d\nsources: [w]\nw: {kind: odometry}\nspace: 3d\n")
+    with pytest.raises(
+        BadConfig, match=r"twice.yaml:4:1: .*'space' stands here a second time; the first is in line 1"
+    ):
+        load_config(path)
+    path.write_text("sources: [w]\nw:\n  kind: odometry\n  topic: /a\n  topic: /b\n")
+    with pytest.raises(BadConfig, match=r"twice.yaml:5:3: .*'topic'"):
+        load_config(path)
+
+
+def test_what_a_file_asks_for_in_vain_is_said_with_its_name():
+    path = Path("robot.yaml")
+    with pytest.raises(BadConfig, match=r"^robot.yaml: no topic '/odom'$"), blaming(path):
+        raise BadConfig("no topic '/odom'")
+    with pytest.raises(BadConfig, match=r"^robot.yaml:3: bad$"), blaming(path):
+        raise BadConfig("robot.yaml:3: bad")
+    with pytest.raises(BadConfig, match=r"^no topic$"), blaming(None):
+        raise BadConfig("no topic")

@@ -4,6 +4,8 @@ from collections.abc import Iterator
 from dataclasses import replace
 from math import dist
 
+import numpy as np
+
 from ..geometry import covariance_from_ros, covariance_to_ros, inverse_of, matrix_of, seven_of_matrix
 from ..graph import Decision
 from ..measurement import SECOND, Array, Measurement, frozen
@@ -74,8 +76,9 @@ class Continuity:
         after = self._shift @ before
         covariance = item.covariance.reshape(6, 6).copy()
         covariance[self._unused] = covariance[:, self._unused] = 0.0
-        at_child = covariance_from_ros(covariance, before[:3, :3])
-        turned = covariance_to_ros(at_child, after[:3, :3])
+        with np.errstate(all="ignore"):  # where `noise` does not read it, it has not been judged
+            at_child = covariance_from_ros(covariance, before[:3, :3])
+            turned = covariance_to_ros(at_child, after[:3, :3])
         return replace(item, pose=frozen(seven_of_matrix(after)), covariance=frozen(turned.reshape(36)))
 
     def _matrix(self, item: OdometryPose) -> Array:

@@ -123,6 +123,12 @@ def _judge_definite(matrix: Array, what: str) -> None:
     if (diagonal <= 0).any():
         raise Fault(f"{what}_indefinite", float(diagonal.min()))
     scale = np.sqrt(diagonal)
-    smallest = float(np.linalg.eigvalsh(matrix / scale[:, None] / scale)[0])
+    with np.errstate(over="ignore"):
+        scaled = matrix / scale[:, None] / scale
+    if (
+        largest := float(np.abs(scaled).max())
+    ) > 1 + ASYMMETRY:  # no correlation is; eigenvalues may not converge
+        raise Fault(f"{what}_indefinite", 1 - largest)
+    smallest = float(np.linalg.eigvalsh(scaled)[0])
     if not smallest > 0:
         raise Fault(f"{what}_indefinite", smallest)

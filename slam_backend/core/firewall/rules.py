@@ -21,6 +21,7 @@ TINY_VARIANCE = 1e-18  # m^2 or rad^2: a sigma of a nanometre; what an integer i
 ASYMMETRY = 1e-6  # relative to the largest entry
 JITTER = 1.0  # m that a step may jump besides max_speed: odometry arrives in bursts
 JUMP = 1.0  # s that stamps of the driving source may leap ahead before the next message is asked
+WITNESSES = 3  # messages in a row, each following the other, that make a leap believed
 USUAL = 4.0  # times its last step: slow sources leap by habit
 SILENCE = 10.0  # s without the driving source that are worth a note
 EPOCH = 3600.0  # s; a leap beyond is a clock that was set, not a pause
@@ -66,7 +67,7 @@ RULES: Mapping[str, Rule] = {
         "error", "the stamp is too far ahead of the driving source", _CLOCK, _DEFAULTS[1].ahead, "s", "settle.ahead"
     ),
     "settle/jump": Rule(
-        "warn", "a lone message of the driving source leaps ahead; the next one does not follow it", _STAMP, JUMP, "s"
+        "warn", "the driving source leaps ahead, and what comes next does not follow", _STAMP, JUMP, "s"
     ),
     "settle/clock_jump": Rule(
         "error", "the clock of the driving source was set",

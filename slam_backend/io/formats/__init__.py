@@ -85,6 +85,8 @@ def write_trajectory(path: Path, trajectory: "Trajectory") -> tuple[str, ...]:
 def convert(source: Path, target: Path, *, rotation_information: "Convention" = "gtsam") -> str:
     """Read `source`, write `target`, say in one line what was done and what was lost. BadFile if it cannot be done."""
     form, written = format_of(source), _named(target, None)
+    if target.exists() and target.samefile(source):
+        raise BadFile(f"{target}: is the input itself, which would be overwritten; name another file")
     if form.kind == "trajectory":
         if written.kind == "graph":
             raise BadFile(

@@ -1,5 +1,6 @@
 """Text files as rows of words that know where they stand, so that every complaint names file, line and word."""
 
+import errno
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
@@ -12,6 +13,14 @@ from numpy.typing import NDArray
 from ...core.errors import BadFile
 from ...core.measurement import SECOND, Array, format_stamp
 
+HINTS: Mapping[int, str] = {
+    errno.ENOENT: "check the path",
+    errno.EISDIR: "name a file in it",
+    errno.ENOTDIR: "check the path",
+    errno.EACCES: "check its permissions",
+    errno.EROFS: "write somewhere else",
+    errno.ENOSPC: "make room, or write somewhere else",
+}
 Ids = NDArray[np.uint64]
 Ranks = NDArray[np.int64]
 Stamps = NDArray[np.int64]
@@ -24,6 +33,7 @@ class Rows:
     path: Path
     numbers: list[int]
     words: list[list[str]]
+    ended: bool = True  # the last line, with a line feed: else the file may have been cut in it
 
     def __len__(self) -> int:
         return len(self.words)
@@ -88,7 +98,8 @@ class Rows:
 def read_rows(path: Path, separator: str | None = None, comment: str = "#") -> Rows:
     """Every line that holds anything but a comment, cut into words (at `separator`; none: at white space)."""
     numbers, words = [], []
-    for number, line in enumerate(read_text(path).split("\n"), start=1):
+    text = read_text(path)
+    for number, line in enumerate(text.split("\n"), start=1):
         body = line.partition(comment)[0] if comment in line else line
         cut = body.split() if separator is None else [word.strip() for word in body.split(separator)]
         if cut and cut != [""]:
@@ -96,7 +107,7 @@ def read_rows(path: Path, separator: str | None = None, comment: str = "#") -> R
             words.append(cut)
     if not words:
         raise BadFile(f"{path}: holds nothing but comments and white space")
-    return Rows(path, numbers, words)
+    return Rows(path, numbers, words, text.endswith("\n"))
 
 
 def by_tag(rows: Rows, known: Iterable[str]) -> tuple[Mapping[str, Rows], tuple[str, ...]]:
@@ -112,10 +123,14 @@ def by_tag(rows: Rows, known: Iterable[str]) -> tuple[Mapping[str, Rows], tuple[
             group.words.append(words)
     if not any(groups.values()):
         raise rows.bad(0, rows.words[0][0], f"no line of this file has a known tag ({', '.join(groups)})")
-    notes = (
+    notes = [
         f"{len(lines)} lines '{shown(tag)}' skipped (the first is line {lines[0]})"
         for tag, lines in strange.items()
-    )
+    ]
+    if not rows.ended:
+        notes.append(
+            f"line {rows.numbers[-1]} ends without a line feed: if the file was cut there, its last number is wrong"
+        )
     return groups, tuple(notes)
 
 
@@ -139,7 +154,7 @@ def read_bytes(path: Path, limit: int = -1) -> bytes:
         with path.open("rb") as file:
             return file.read(limit)
     except (OSError, ValueError) as error:  # ValueError: a path with a null byte
-        raise BadFile(f"{path}: cannot be read: {_reason(error)}") from None
+        raise BadFile(f"{path}: cannot be read: {reason_of(error)}") from None
 
 
 def write_lines(path: Path, lines: Iterable[str]) -> None:
@@ -147,7 +162,7 @@ def write_lines(path: Path, lines: Iterable[str]) -> None:
     try:
         path.write_text(text, encoding="utf-8", newline="\n")
     except (OSError, ValueError) as error:
-        raise BadFile(f"{path}: cannot be written: {_reason(error)}") from None
+        raise BadFile(f"{path}: cannot be written: {reason_of(error)}") from None
 
 
 def exact(values: Array) -> list[str]:
@@ -214,5 +229,8 @@ def _is_finite(word: str) -> bool:
     return bool(np.isfinite(float(word)))
 
 
-def _reason(error: OSError | ValueError) -> str:
-    return (error.strerror if isinstance(error, OSError) else None) or str(error)
+def reason_of(error: OSError | ValueError) -> str:
+    """Why a file cannot be read or written, and what to do where that is plain."""
+    why = (error.strerror if isinstance(error, OSError) else None) or str(error)
+    hint = HINTS.get(error.errno or 0) if isinstance(error, OSError) else None
+    return f"{why}; {hint}" if hint else why

@@ -68,7 +68,7 @@ def test_a_source_of_any_rate_passes_whole(period):
 
 def test_a_leap_at_the_end_has_no_witness():
     assert judged(1, 1.1, 1.2, 50) == ["1", "1.1", "1.2", "refused jump@50"]
-    assert judged(1, 50) == ["1", "50"]
+    assert judged(1, 50) == ["1", "accepted gap@50", "50"]
     assert judged(7) == ["7"]
     assert judged(7, end=False) == []
 
