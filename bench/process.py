@@ -234,10 +234,11 @@ class Backend:
         return json.loads((self.folder / "run" / "summary.json").read_text())
 
     def rows(self, session: str = "") -> dict[str, int]:
-        """How many messages the journal holds of each topic."""
+        """How many messages the journal holds of each topic that was heard."""
         with sqlite3.connect(self.folder / f"journal{session}.db3") as journal:
             found = journal.execute(
-                "SELECT t.name, count(*) FROM messages m JOIN topics t ON t.id = topic_id GROUP BY 1"
+                "SELECT t.name, count(*) FROM messages m JOIN topics t ON t.id = topic_id "
+                "WHERE t.name != '/slam_backend/session' GROUP BY 1"
             )
             return dict(found)
 

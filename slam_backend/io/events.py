@@ -36,7 +36,9 @@ def decisions(message: Any, source: str) -> Iterator[Decision]:
     event = json.loads(message.data)
     if event["event"] == "gap":
         after, until, lost, why = (event[key] for key in ("after", "until", "lost", "why"))
-        detail = f"{lost} records that came between log times {after} and {until} ns are lost: {why}"
+        detail = (
+            f"{lost or 'some'} records that came between log times {after} and {until} ns are lost: {why}"
+        )
         yield Decision(
             until, f"gap@{after}", source, "refused", "journal", "gap", detail, count=max(int(lost), 1)
         )
@@ -46,7 +48,7 @@ DECODERS: Mapping[str, Callable[[Any, str], Iterable[Decision]]] = {TYPE: decisi
 
 
 def gap(after: int, until: int, lost: int, why: str) -> Event:
-    """after, until: ns, the log times of the records before and behind it. lost: how many, as far as is known."""
+    """after, until: ns, the log times of the records before and behind it. lost: how many; 0: not known."""
     return {"event": "gap", "after": after, "until": until, "lost": lost, "why": why}
 
 

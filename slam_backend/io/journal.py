@@ -34,6 +34,7 @@ ROWS = (
     "SELECT m.id, t.name, t.type, m.timestamp, m.data, c.crc32 FROM messages m NOT INDEXED "
     "JOIN topics t ON t.id = m.topic_id LEFT JOIN checksums c ON c.id = m.id WHERE m.id > ? ORDER BY m.id LIMIT ?"
 )
+HEARD = "SELECT 1 FROM messages m JOIN topics t ON t.id = m.topic_id WHERE t.name != ? LIMIT 1"
 
 
 class Row(NamedTuple):
@@ -46,7 +47,7 @@ class Row(NamedTuple):
 class Journal:
     """Append from any thread; `committed` is the id of the newest row that is acknowledged: on disk, for readers to see.
 
-    lost: records that could not be kept, since the file could not be written for long. trouble: why it cannot be
+    heard: whether it holds anything but what it says of itself. lost: records that could not be kept, since the file could not be written for long. trouble: why it cannot be
     written just now; empty: it can.
     """
 
@@ -71,6 +72,7 @@ class Journal:
                 "SELECT coalesce(max(id), 0), coalesce(max(timestamp), 0) FROM messages"
             ).fetchone()
             self._topics = topics_of(self._database)
+            self.heard = self._database.execute(HEARD, (events.TOPIC,)).fetchone() is not None
             self._file = _identity(self.path)
         except (OSError, sqlite3.Error) as error:
             raise BadFile(f"{self.path}: cannot be used as journal: {error}") from None
@@ -129,9 +131,11 @@ class Journal:
             begin = after + 1 - self._queue[0][0]
             return [Row(*row) for row in islice(self._queue, begin, begin + limit)]
 
-    def close(self) -> None:
-        """Commit what is queued; afterwards the one file holds everything."""
+    def close(self, farewell: Event | None = None) -> None:
+        """Commit what is queued, and a last word; afterwards the one file holds everything."""
         with self._arrival:
+            if farewell is not None and not self._stop.is_set():
+                self._enqueue(events.TOPIC, events.TYPE, events.encoded(farewell))
             self._stop.set()
         self._wake.set()
         self._thread.join()
@@ -141,6 +145,7 @@ class Journal:
     def _enqueue(self, topic: str, type_: str, data: bytes) -> None:
         self._newest = max(self._newest + 1, time_ns())
         self._appended += 1
+        self.heard |= topic != events.TOPIC
         self._queue.append((self._appended, Record(topic, type_, self._newest, data)))
 
     def _lose(self) -> None:

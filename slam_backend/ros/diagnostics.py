@@ -101,6 +101,7 @@ class Diagnostics:
             "alive": str(feeder.alive).lower(),
             "queue": str(feeder.backlog),
             "restarts": str(feeder.restarts),
+            "acknowledged": str(journal.committed),
             "unwritten": str(journal.waiting),
             "lost": str(journal.lost),
         }
@@ -125,16 +126,17 @@ class Diagnostics:
     def _how(self, feeder: Feeder, journal: Journal) -> tuple[int, str]:
         """The worst that there is to say of the worker."""
         when, what = self._state.incidents[-1] if self._state.incidents else (0.0, "")
-        if not feeder.alive:
-            return ERROR, "the worker is dead; another is being started"
-        if journal.trouble:
-            return ERROR, journal.trouble
-        if what and monotonic() - when < FRESH:
-            return ERROR, what
-        if self._state.paused:
-            return WARN, f"paused; {feeder.backlog} records wait"
-        if feeder.backlog > BEHIND:
-            return WARN, f"the worker is {feeder.backlog} records behind"
+        state, backlog = self._state, feeder.backlog
+        for is_so, level, message in (
+            (not feeder.alive, ERROR, "the worker is dead; another is being started"),
+            (bool(journal.trouble), ERROR, journal.trouble),
+            (bool(what) and monotonic() - when < FRESH, ERROR, what),
+            (state.restored < 1, WARN, f"restoring: {state.restored:.0%} of the session so far"),
+            (state.paused, WARN, f"paused; {backlog} records wait"),
+            (backlog > BEHIND, WARN, f"the worker is {backlog} records behind"),
+        ):
+            if is_so:
+                return level, message
         return OK, "solving"
 
 

@@ -29,15 +29,16 @@ class Finder:
         self._since: dict[str, float] = {}
         self.unused: dict[str, str] = {}  # topic -> why
 
-    def wants(self, record: Record) -> bool:
+    def wants(self, record: Record, config: Config) -> bool:
         """Whether the message is to be kept: its topic is a source, or may become one; of transforms, the odometry only."""
-        known = record.topic in self._kinds and record.topic not in self.unused
+        known = _is_source(record.topic, config) or record.topic in self._kinds
+        known = known and record.topic not in self.unused
         return known and (record.type != TRANSFORMS or kind_of(record, self._typestore) is not None)
 
     def look(self, record: Record, config: Config) -> Config:
         """The configuration; with this topic as a source, and those that waited for it, once it can be one."""
         topic = record.topic
-        if topic in self.unused or any(source.topic == topic for source in config.sources.values()):
+        if topic in self.unused or _is_source(topic, config):
             return config
         if topic not in self._kinds and not self._recognize(record):
             return config
@@ -74,7 +75,7 @@ class Finder:
         return monotonic() - self._since[topic] >= PATIENCE.get((kind, self._types[topic]), LONGEST)
 
     def _with(self, topic: str, config: Config) -> Config:
-        if any(source.topic == topic for source in config.sources.values()):
+        if _is_source(topic, config):
             return config
         data, name = config_to(config), name_of(topic)
         while name in data or name in data["sources"]:
@@ -85,6 +86,10 @@ class Finder:
         except BadConfig as error:
             self.unused[topic] = str(error)
             return config
+
+
+def _is_source(topic: str, config: Config) -> bool:
+    return any(source.topic == topic for source in config.sources.values())
 
 
 def _has_odometry(config: Config) -> bool:

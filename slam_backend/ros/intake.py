@@ -106,7 +106,7 @@ class Intake:
             self._host.work(session, config)
         if record.topic in finder.unused:
             self._host.ignore(record.topic, finder.unused[record.topic])
-        return finder.wants(record)
+        return finder.wants(record, self._host.config)
 
     def _odometry_in(self, record: Record) -> Sequence[OdometryPose]:
         """What the driving source says in it, unless it cannot be right."""

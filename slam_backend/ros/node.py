@@ -27,6 +27,7 @@ from ..core.graph import Decision
 from ..core.measurement import SECOND
 from ..core.sensors.odometry import OdometryPose
 from ..io.feeder import Feeder, undisturbed
+from ..io.restore import RUN, Examination
 from ..io.typestore import typestore_of
 from .diagnostics import Diagnostics
 from .inputs import Inputs
@@ -34,8 +35,9 @@ from .intake import Intake
 from .outputs import Outputs
 from .parameters import changed, config_of, declare
 from .pose import Odometer
+from .restoring import Restoring
 from .services import Services
-from .session import RUN, Session
+from .session import Session
 from .snapshots import Snapshots
 from .state import State
 from .steadfast import SteadfastNode, explained, survived
@@ -69,6 +71,7 @@ class BackendNode(SteadfastNode):
         self._answering: Services | None = None
         self._diagnostics: Diagnostics | None = None
         self._odometer = Odometer(self.config)
+        self._restoring = Restoring(0, self.get_logger().info)
         self._beats: dict[str, Any] = {}
         self._count = count(1)
         self._changing = threading.Lock()  # a session ends, or begins
@@ -168,7 +171,7 @@ class BackendNode(SteadfastNode):
             self._end(ended)
         self.state.clear()
         self._odometer = Odometer(self.config)
-        self.session = self._opened()
+        self.session = self._opened(fresh=True)
         self.get_logger().info("a new session has begun")
 
     def _renew_in_background(self, ended: Session | None) -> None:
@@ -197,14 +200,29 @@ class BackendNode(SteadfastNode):
 
     # -- session ---------------------------------------------------------------------------------
 
-    def _opened(self) -> Session:
+    def _opened(self, *, fresh: bool = False) -> Session:
         """Journal and worker. BadFile where the data directory cannot be used."""
-        session = Session(self.data_dir, self.state, self.incident)
+        session = Session(self.data_dir, self.state, self.incident, self.config, fresh=fresh)
+        config = session.config(self.config)
+        if session.past is not None:
+            self._explain(session.past, config)
         if self._intake is not None:
             self._intake.begin(session)
-        if self.config.sources:
-            self.work(session, self.config)
+        if config.sources:
+            self.work(session, config)
         return session
+
+    def _explain(self, past: Examination, config: Config) -> None:
+        """A session goes on: say so, and what is different."""
+        log = self.get_logger()
+        log.info(f"{past.path}: its session was not ended, and goes on: {past.records} records are restored")
+        if past.torn:
+            log.warning(f"{past.path}: {past.torn}")
+        if not past.is_solved_alike(config):
+            log.warning(
+                "the configuration is not that of the session so far: its trajectory will be another one"
+            )
+        self._restoring = Restoring(past.records, log.info)
 
     def work(self, session: Session, config: Config) -> None:
         """Solve with these sources from the start of the session on."""
@@ -325,6 +343,7 @@ class BackendNode(SteadfastNode):
     @survived
     def _diagnose(self) -> None:
         session = self.session
+        self._restoring.look(self.state.applied)
         if self._inputs is not None and self._diagnostics is not None:
             self._diagnostics.publish(
                 self._inputs, self._feeder(), session.journal if session else None, self.config

@@ -7,30 +7,70 @@ from typing import Any
 from uuid import uuid4
 
 from ..core.command import TOPIC, TYPE, command, text_of
-from ..core.config import Config
+from ..core.config import Config, config_hash, config_to
 from ..core.errors import BadFile, SlamError
 from ..core.graph import Decision
 from ..core.sensors import SENSORS
 from ..io.encode import encode_string
 from ..io.feeder import Feeder
 from ..io.inputs import OWN
-from ..io.journal import NAME as JOURNAL
 from ..io.journal import Journal
+from ..io.replay import versions
+from ..io.restore import RUN, Examination, claim, salvage, set_aside, unfinished
 from .state import State
-
-RUN = "run"  # the folder, beside the journal, of the run that is saved at the end
 
 
 class Session:
-    """incident: told in words when something went wrong, from any thread."""
+    """incident: told in words when something went wrong, from any thread. past: what there was of it when it was taken up again."""
 
-    def __init__(self, folder: Path, state: State, incident: Callable[[str], None]) -> None:
-        """An earlier session's journal and run are set aside. BadFile where the folder cannot be used."""
+    def __init__(
+        self,
+        folder: Path,
+        state: State,
+        incident: Callable[[str], None],
+        config: Config,
+        *,
+        fresh: bool = False,
+    ) -> None:
+        """Goes on with the session in the folder, if that was not ended; else its journal and run are set aside.
+
+        fresh: a new session in any case. BadFile where the folder cannot be used.
+        """
         self._state, self._incident, self._folder = state, incident, folder
-        _set_aside(folder)
-        self.journal = Journal(folder, incident)
+        self._claim = claim(folder)
+        try:
+            self.past = None if fresh else self._taken_up(config)
+            if self.past is None:
+                set_aside(folder)
+            self.journal = Journal(folder, incident, config.journal)
+        except BadFile:
+            self._claim.close()
+            raise
+        self.journal.note({"event": "resume" if self.past else "begin", "versions": versions()})
         self.feeder: Feeder | None = None
         self._lock, self._ended = threading.Lock(), False
+
+    def _taken_up(self, config: Config) -> Examination | None:
+        try:
+            past = unfinished(self._folder, config.journal.resume)
+        except BadFile as error:
+            self._incident(f"{error}; it is set aside, and a new session begins")
+            return None
+        if past is None:
+            return None
+        if not config.sources and past.config is None:
+            self._incident(
+                f"{past.path}: is not gone on with: neither it nor the configuration names its sources"
+            )
+            return None
+        if past.damage:
+            self._incident(salvage(past))
+        return past
+
+    def config(self, given: Config) -> Config:
+        """With the sources that were found before, where none are given."""
+        before = self.past.config if self.past is not None else None
+        return given.model_copy(update={"sources": before.sources}) if before and not given.sources else given
 
     def work(self, config: Config) -> None:
         """A worker for these sources; one that runs already is replaced, and the new one reads the journal from its start."""
@@ -48,6 +88,7 @@ class Session:
                     for source in config.sources.values()
                 }
             )
+            self.journal.note({"event": "config", "config": config_to(config), "hash": config_hash(config)})
             self._state.expect(self.journal.committed)
             self.feeder = Feeder(self.journal, config, table, self._state.take, self._incident, held)
             self.feeder.pause(self._state.paused)  # as it is by now
@@ -94,24 +135,13 @@ class Session:
         """
         with self._lock:
             self._ended = True
-        self.journal.close()
-        if self.feeder is None:
-            return None
-        if not self.journal.committed:
-            self.feeder.close()
-            return None
-        return self.feeder.finish(str(self._folder / RUN), seconds)
-
-
-def _set_aside(folder: Path) -> None:
-    """What an earlier session left keeps its place in the folder, under the next free number."""
-    n = 1
-    while any((folder / name).exists() for name in (f"journal-{n}.db3", f"{RUN}-{n}")):
-        n += 1
-    names = {f"{JOURNAL}{ending}": f"journal-{n}.db3{ending}" for ending in ("", "-wal", "-shm")}
-    for name, kept in {**names, RUN: f"{RUN}-{n}"}.items():
+        self.journal.close({"event": "end"})
         try:
-            if (folder / name).exists():
-                (folder / name).rename(folder / kept)
-        except OSError as error:
-            raise BadFile(f"{folder / name}: cannot be set aside: {error.strerror}") from None
+            if self.feeder is None:
+                return None
+            if not self.journal.heard:
+                self.feeder.close()
+                return None
+            return self.feeder.finish(str(self._folder / RUN), seconds)
+        finally:
+            self._claim.close()

@@ -34,17 +34,30 @@ class State:
         self.paused = False  # inputs are journaled but not applied; outlasts a session
         self._untold: list[Decision] = []
         self._unshown = False
+        self._newest: tuple[Update, tuple[float, ...] | None] | None = None  # of the worker; perhaps not news
         self._behind = 0  # rows that a new worker has yet to read before its updates are news
 
     def take(self, report: Report) -> None:
         with self._lock:
             self.report = report
-            if report.updates and report.applied >= self._behind:
-                self.update, self.covariance = report.updates[-1], report.covariance
+            if report.updates:
+                self._newest = report.updates[-1], report.covariance
+            if self._newest is not None and report.applied >= self._behind:
+                self.update, self.covariance = self._newest
             for decision in report.decisions:
                 self._decide(decision)
             self._lock.notify_all()
         self._changed()
+
+    @property
+    def applied(self) -> int:
+        """Rows that the worker has read."""
+        return self.report.applied if self.report is not None else 0
+
+    @property
+    def restored(self) -> float:
+        """How much of what a new worker has to catch up with it has read; 1 when it is done."""
+        return min(self.applied / self._behind, 1.0) if self._behind else 1.0
 
     def decision(self, id_: str, seconds: float, unless: Callable[[], bool]) -> Decision | None:
         """Wait for the decision with that id; None if it did not come in time (s), or something else is true."""
@@ -59,7 +72,7 @@ class State:
         it has read so many rows.
         """
         with self._lock:
-            self._behind = rows
+            self._behind, self._newest = rows, None
             self.decided, self.refused, self.noted, self._untold = {}, {}, {}, []
 
     def happen(self, what: str, decision: Decision | None = None) -> None:
@@ -87,7 +100,7 @@ class State:
         with self._lock:
             self.report = self.update = self.covariance = self.snapshot = None
             self.decided, self.refused, self.noted, self._untold = {}, {}, {}, []
-            self._unshown, self._behind = False, 0
+            self._unshown, self._behind, self._newest = False, 0, None
 
     def untold_decisions(self) -> list[Decision]:
         """Those that have not been published yet; each is handed out once."""

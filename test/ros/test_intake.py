@@ -84,6 +84,9 @@ class Seen:
             self.config = self.finder.look(record, self.config)
         return {source.topic: source.kind for source in self.config.sources.values()}
 
+    def wants(self, record):
+        return self.finder.wants(record, self.config)
+
 
 @pytest.fixture
 def seen():
@@ -99,10 +102,18 @@ def impatient(monkeypatch):
 
 def test_odometry_drives_at_once_and_brings_in_what_waited(seen) -> None:
     assert seen.look(LOOP, TAGS, IN_MAP) == {}
-    assert all(seen.finder.wants(record) for record in (LOOP, TAGS, IN_MAP))
+    assert all(seen.wants(record) for record in (LOOP, TAGS, IN_MAP))
     assert seen.look(ODOMETRY) == {"/odom": "odometry", "/tags": "landmark", "/localizer": "pose"}
     assert seen.look(LOOP)["/loops"] == "relative"
     assert seen.config.driver == "odom"
+
+
+def test_sources_that_were_found_before_a_crash_are_wanted_at_once(seen) -> None:
+    """Though nothing has been heard of them since."""
+    seen.look(ODOMETRY, LOOP)
+    seen.finder = Finder(typestore_of(()))
+    assert seen.wants(LOOP)
+    assert seen.look(LOOP) == {"/odom": "odometry", "/loops": "relative"}
 
 
 def test_what_is_of_no_use_is_told_with_the_reason(seen) -> None:
@@ -115,16 +126,16 @@ def test_what_is_of_no_use_is_told_with_the_reason(seen) -> None:
         "/scan": "it holds nothing that could be used",
         "/rubbish": "it holds nothing that could be used",
     }
-    assert not any(seen.finder.wants(record) for record in (truth, second, SCAN, rubbish))
+    assert not any(seen.wants(record) for record in (truth, second, SCAN, rubbish))
 
 
 def test_the_pair_on_tf_waits_for_better_odometry(seen) -> None:
     pair = transforms("odom", "base")
     assert seen.look(transforms("base", "wheel"), pair) == {}
-    assert seen.finder.wants(pair)
-    assert not seen.finder.wants(transforms("base", "wheel"))
+    assert seen.wants(pair)
+    assert not seen.wants(transforms("base", "wheel"))
     assert seen.look(ODOMETRY, pair) == {"/odom": "odometry"}
-    assert not seen.finder.wants(pair)
+    assert not seen.wants(pair)
 
 
 def test_after_a_while_the_pair_on_tf_serves(seen, impatient) -> None:

@@ -61,7 +61,7 @@ class Host:
 
     def begin(self) -> None:
         self.sessions += 1
-        self.session = Session(self.data_dir / f"session{self.sessions}", self.state, say)
+        self.session = Session(self.data_dir / f"session{self.sessions}", self.state, say, self.config)
         self.session.work(self.config)
 
     @property
