@@ -12,8 +12,6 @@ import slam_backend as sb
 from bench.process import gone
 from slam_backend.io.restore import examine
 
-WORDS = {"begin": 1, "resume": 2, "config": 3, "end": 1}
-
 
 def killed(node, worker_first):
     worker = node.worker()
@@ -29,40 +27,51 @@ def left_of(records, rows):
     return [record for record in records if next(counts[record.topic]) >= rows.get(record.topic, 0)]
 
 
+def publish(peer, node, records):
+    """Each once, in order. A killed node looks alive to DDS for a while, so it does not tell when the new one listens."""
+    topics = {record.topic: record.type for record in records}
+    publishers = {t: peer.publisher(t, k, latched=True) for t, k in topics.items()}
+    for topic in topics:
+        node.process.wait_for(f"listening to {topic} ")
+    peer.spin(1)
+    for record in records:
+        publishers[record.topic].publish(bytes(record.data))
+        peer.spin(0.003)
+    peer.spin(0.1)
+    for publisher in publishers.values():
+        peer.node.destroy_publisher(publisher)
+
+
 @pytest.mark.parametrize(
     "configured", [True, pytest.param(False, marks=pytest.mark.slow)], ids=["configured", "found"]
 )
 def test_a_killed_node_goes_on_where_it_was(backend, peer, drive, configured) -> None:
     """Twice: the node alone, whose worker follows it; then both. Nothing that is in the journal comes again."""
-    third, node = len(drive.records) // 3, None
-    for life in range(3):
-        node = backend(drive.config if configured else None)
-        if life:
-            node.process.wait_for("its session was not ended, and goes on")
-        rest = left_of(drive.records, node.rows() if life else {})
-        assert len(rest) == len(drive.records) or life
-        peer.play(
-            rest[: (life + 1) * third - (len(drive.records) - len(rest))] if life < 2 else rest, rate=20
-        )
-        if life:
-            node.process.wait_for("restored: ")
-        if life < 2:
-            killed(node, worker_first=life == 1)
+    config = drive.config if configured else None
+    node, third = backend(config), len(drive.records) // 3
+    publish(peer, node, drive.records[:third])
+    killed(node, worker_first=False)
+    for upto in (2 * third, len(drive.records)):
+        node = backend(config)
+        node.process.wait_for("its session was not ended, and goes on")
+        publish(peer, node, left_of(drive.records[:upto], node.rows()))
+        node.process.wait_for("restored: ")
+        if upto < len(drive.records):
+            killed(node, worker_first=True)
     summary = node.end()
+    assert not left_of(drive.records, node.rows())
     assert summary["run_hash"] == node.replayed()["run_hash"]
     if configured:
-        assert not left_of(drive.records, node.rows())
-        assert (
-            summary["run_hash"]
-            == sb.replay(drive.bag, sb.load_config(drive.config)).result.summary["run_hash"]
-        )
+        replayed = sb.replay(drive.bag, sb.load_config(drive.config)).result.summary
+        assert summary["run_hash"] == replayed["run_hash"]
     found = examine(node.folder / "journal.db3")
     words = [event["event"] for _, event in found.events]
-    assert {word: words.count(word) for word in WORDS} == WORDS or not configured
+    assert (words[0], words.count("resume"), words[-1]) == ("begin", 2, "end")
     assert found.damage == []
     assert not (node.folder / "journal-1.db3").exists()
 
 
+@pytest.mark.slow
 def test_an_ended_session_is_set_aside_and_two_nodes_do_not_share_a_folder(backend, peer, drive) -> None:
     node = backend(drive.config)
     peer.play(drive.records[:100])
