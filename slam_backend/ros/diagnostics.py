@@ -131,8 +131,8 @@ class Diagnostics:
             (not feeder.alive, ERROR, "the worker is dead; another is being started"),
             (bool(journal.trouble), ERROR, journal.trouble),
             (bool(what) and monotonic() - when < FRESH, ERROR, what),
-            (state.restored < 1, WARN, f"restoring: {state.restored:.0%} of the session so far"),
             (state.paused, WARN, f"paused; {backlog} records wait"),
+            (state.restored < 1, WARN, f"restoring: {state.restored:.0%} of the session so far"),
             (backlog > BEHIND, WARN, f"the worker is {backlog} records behind"),
         ):
             if is_so:
