@@ -6,6 +6,7 @@ from typing import Any
 from ...core.measurement import parse_stamp
 from .subject import Subject
 
+ENTERED = frozenset({"admit/unjudged"})  # rules by which a loop simply came in
 Loop = tuple[Mapping[str, Any], tuple[int, int]]
 
 
