@@ -139,12 +139,16 @@ def work(job: Job, shown: "Progress") -> "Result":
 
 def write(result: "Result", history: "History", out: Path, report: bool, bag: "With | None") -> None:
     """All files of a run directory."""
+    from ..io.formats import trajectory as forms
+    from ..io.formats import write_trajectory
     from ..io.history import NAME
     from ..io.resultbag import write_result_bag
     from ..io.rundir import write_run
     from ..lab.picture import PICTURE, draw
     from ..lab.report import REPORT, write_report
     from ..lab.report.subject import Subject
+    from ..lab.unguarded import NAME as UNGUARDED
+    from ..lab.unguarded import unguarded
 
     write_run(result, out)
     history.write(out / NAME)
@@ -152,6 +156,8 @@ def write(result: "Result", history: "History", out: Path, report: bool, bag: "W
     if bag:
         write_result_bag(result, out, bag)
     if report:
+        if (warped := unguarded(result)) is not None:
+            write_trajectory(out / UNGUARDED, forms.Trajectory(warped.stamps, warped.sevens))
         write_report(Subject(out), out / REPORT)
 
 

@@ -193,6 +193,11 @@ class Backend:
             raise SlamError("there is no keyframe yet: no message of the driving source has been accepted")
         return self._applier.estimate
 
+    @property
+    def left_out(self) -> list[Factor]:
+        """Factors that were offered and are not in the graph: refused, on probation, or taken out by a person."""
+        return self._editor.left_out
+
     def snapshot(self) -> Snapshot:
         """Everything believed now; costs time in proportion to the graph."""
         keyframes = self.timeline.in_order()

@@ -80,6 +80,10 @@ class Editor:
     def wishes(self) -> Wishes:
         return self._history.now
 
+    @property
+    def left_out(self) -> list[Factor]:
+        return [factor for id_, factor in self._known.items() if id_ not in self._solver.factors]
+
     # -- what a person asks ----------------------------------------------------------------------
 
     def plan(self, action: str, arguments: Mapping[str, Any]) -> Plan:

@@ -45,7 +45,7 @@ FILES = ("summary.json", "config.yaml", "trajectory.tum", "odometry.tum", "onlin
 ALIKE = 1e-6  # m and of quaternions; between replays on different machines
 RESULT_BAG = "run.mcap"
 INPUTS = "inputs"  # a folder of symbolic links
-DRAWN = ("trajectory.png", "report.html", HISTORY, RESULT_BAG)  # by the command line
+DRAWN = ("trajectory.png", "report.html", "unguarded.tum", HISTORY, RESULT_BAG)  # by the command line
 
 
 def write_run(result: Result, out: Path | str) -> None:

@@ -146,6 +146,26 @@ def test_a_filter_and_the_truth_are_drawn_beside_the_run(plane, tmp_path):
     assert float(rows["smoothed"]) < float(rows["filter"]) < float(rows["odometry alone"])
 
 
+def test_wrong_loops_that_were_kept_out_are_shown_in_a_map_that_took_them(tmp_path):
+    options = Options(poses=400, loop_rate=0.3, wrong_loop_rate=0.3)
+    drive = write_simulation(simulate("square", 3, options), tmp_path / "drive.mcap")
+    arguments = [
+        "replay",
+        drive.bag,
+        "--config",
+        drive.config,
+        "--set",
+        "robust=[pcm]",
+        "--out",
+        tmp_path / "run",
+    ]
+    assert main(list(map(str, arguments))) == 0
+    page = (tmp_path / "run" / "report.html").read_text()
+    assert "Without judges" in titles(page)
+    away = float(re.search(r"poses would lie ([\d.]+) m", page).group(1))
+    assert away > 1.0  # the map that took them is bent
+
+
 def test_cliques_of_a_chain_and_of_a_full_graph() -> None:
     assert sorted(_cliques([[0, 1], [1, 2], [2, 3], [3]])) == [2, 2, 2]
     assert _cliques([[0, 1, 2], [1, 2], [2]]) == [3]

@@ -18,6 +18,7 @@ from . import (
     summary,
     timing,
     trajectory,
+    unguarded,
 )
 from .page import Section, html
 from .subject import Subject
@@ -28,6 +29,7 @@ SECTIONS: Sequence[Callable[[Subject], Section | None]] = (
     trajectory.section,
     playback.section,
     loops.section,
+    unguarded.section,
     drift.section,
     residuals.section,
     neighbours.section,
