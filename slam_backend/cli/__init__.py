@@ -24,6 +24,7 @@ VERBS: Mapping[
     "replay": "Bags and pose graphs through the smoother, into a run directory.",
     "run": "The ROS 2 node.",
     "play": "A bag's messages to real topics.",
+    "journal": "A node's journal: what it holds, whether it is whole, as a bag.",
     "solve": "The optimum of a pose graph.",
     "dataset": "A public data set that ships with gtsam, as a bag.",
     "simulate": "A world with ground truth, as a bag.",

@@ -3,7 +3,7 @@
 import fcntl
 import sqlite3
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import closing, suppress
 from dataclasses import dataclass
 from itertools import count, islice
@@ -64,8 +64,8 @@ def _decisive(config: Config) -> dict[str, object]:
     return {name: value for name, value in config_to(config).items() if name not in BESIDE_THE_RESULT}
 
 
-def examine(path: Path) -> Examination:
-    """Read every record. BadFile if nothing of it can be read."""
+def examine(path: Path, advance: Callable[[int], None] = lambda _: None) -> Examination:
+    """Read every record, with a call of `advance(n)` for each n. BadFile if nothing of it can be read."""
     left = torn(path.with_name(f"{path.name}-wal"))
     topics: Counter[str] = Counter()
     first, last = None, 0
@@ -73,6 +73,7 @@ def examine(path: Path) -> Examination:
     with open_bag(path) as bag:
         for record in bag.records():
             topics[record.topic] += 1
+            advance(1)
             first, last = first or record.log_time, record.log_time
             if events.is_own(record):
                 with suppress(ValueError):
@@ -95,7 +96,7 @@ def claim(folder: Path) -> IO[str]:
     except OSError:
         lock.close()
         raise BadFile(
-            f"{folder}: another process writes its journal there: give each a data_dir of its own"
+            f"{folder}: in use: another process writes its journal there; a node has its data_dir for itself"
         ) from None
     return lock
 

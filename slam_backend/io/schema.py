@@ -55,12 +55,13 @@ def open_journal(path: Path) -> sqlite3.Connection:
             database.execute(SEAL)
             database.execute(f"PRAGMA user_version={VERSION}")
     if is_new:
-        _sync(path.parent)  # SQLite syncs the folder for its logs, not for the database itself
+        sync(path.parent)  # SQLite syncs the folder for its logs, not for the database itself
     return database
 
 
-def _sync(folder: Path) -> None:
-    descriptor = os.open(folder, os.O_RDONLY)
+def sync(path: Path) -> None:
+    """Wait until a file, or the names in a folder, are on the disk."""
+    descriptor = os.open(path, os.O_RDONLY)
     try:
         os.fsync(descriptor)
     finally:
