@@ -10,6 +10,7 @@ from typing import Any
 
 import gtsam
 
+from .adopted import Adopted
 from .apply import Applier
 from .assembly import Assembly, assembled
 from .command import Command
@@ -106,7 +107,9 @@ class Editor:
         now = self._solver.factors
         added = [factor for id_, factor in now.items() if held.get(id_) is not factor]
         removed = [id_ for id_, factor in held.items() if now.get(id_) is not factor]
-        self._applier.replace(estimate, plan.graph.parts, added, removed)
+        # gtsam's planar factors are noisy near their optimum, to some micrometres: until the next update the batch's answer holds
+        exact = Adopted(plan.solution.values, self._space, estimate)
+        self._applier.replace(exact, plan.graph.parts, added, removed)
         changed = sorted(_changed(before, plan.history.now))
         return plan, [self._decision(self._known[id_], plan.reason, command) for id_ in changed]
 
