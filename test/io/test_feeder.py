@@ -137,14 +137,19 @@ def test_a_command_is_part_of_what_a_new_worker_reads(stage, drive) -> None:
     stage.append(records[:half])
     stage.journal.append(TOPIC, TYPE, encode_string(text_of(command("17", "optimize", {}))))
     stage.until(lambda: any(decision.id == "command/17" for decision in stage.decisions))
-    stage.append(records[half:-50])
-    stage.until(stage.has_read(len(records) - 49))
+    stage.append(records[half : half + 20])
+    stage.journal.append(TOPIC, TYPE, encode_string(text_of(command("18", "edit", {"disable": ["loops"]}))))
+    stage.append(records[half + 20 : half + 40])
+    stage.journal.append(TOPIC, TYPE, encode_string(text_of(command("19", "undo", {}))))
+    stage.append(records[half + 40 : -50])
+    stage.until(stage.has_read(len(records) - 47))
     os.kill(stage.feeder.pid, signal.SIGKILL)
     stage.append(records[-50:])
     told = stage.finish()
     assert told["run_hash"] == replay(stage.journal.path, stage.config).result.summary["run_hash"]
     assert told["run_hash"] != summary["run_hash"]
-    assert told["decisions"]["command/optimize"] == 1
+    assert told["decisions"]["command/optimize"] == told["decisions"]["command/undo"] == 1
+    assert told["decisions"]["edit/disabled"] == told["decisions"]["edit/undone"] > 0
     assert FinishedRun(stage.folder / "run").again().result.summary["run_hash"] == told["run_hash"]
     assert [decision.id for decision in stage.decisions].count("command/17") == 1
 
