@@ -48,6 +48,9 @@ def checked(items: Stream, config: Config) -> Iterator[Measurement | Decision]:
         except Fault as fault:
             yield decided(item, "refused", f"check/{fault.reason}", fault.statistic, fault.threshold)
             continue
+        if not notes:
+            yield item
+            continue
         for note in notes:
             if (item.source, note) not in noted:  # of the source, not of a loop
                 noted.add((item.source, note))

@@ -42,7 +42,10 @@ def settled(
             yield from queue.take(item, clock.newest)
         else:
             for each in clock.judge(item):
-                yield from (each,) if isinstance(each, Decision) else queue.drive(each)
+                if isinstance(each, Decision):
+                    yield each
+                else:
+                    yield from queue.drive(each)
     if last_resort:
         for each in clock.end():
             yield from (each,) if isinstance(each, Decision) else queue.drive(each)
