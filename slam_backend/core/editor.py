@@ -15,11 +15,11 @@ from .apply import Applier
 from .assembly import Assembly, assembled
 from .command import Command
 from .edits import Wishes, edit_of, weighted
-from .errors import SlamError
+from .errors import SlamError, SolverFailure
 from .graph import Decision, Delta, Factor, Verdict, is_pose
 from .solvers import Solver
 from .solvers.batch import Solution, polish, solve
-from .solvers.descent import Options
+from .solvers.descent import SINGULAR, Options
 from .solvers.initialize import cost_of
 from .space import Space
 
@@ -193,6 +193,8 @@ class Editor:
             if near
             else solve(graph.factors, graph.values, Options(polish=True))
         )
+        if solution.stop == SINGULAR:
+            raise SolverFailure("the factors that are left do not hold every pose and landmark", ())
         shift = self._shift(before, solution.values)
         cost = {"before": cost_of(list(held.values()), before), "after": solution.cost}
         told = {

@@ -219,6 +219,36 @@ def test_a_landmark_that_nobody_sees_any_more_is_gone_until_undo(laps):
     assert np.abs(poses(backend) - whole).max() < 0.1
 
 
+def test_a_landmark_cannot_be_left_with_less_than_holds_it(laps):
+    """Without its position a bearing alone does not say where the tree is: the edit is refused whole."""
+
+    def sightings():
+        for item in laps:
+            yield item
+            if item.source != "odometry" or item.stamp not in (2 * SECOND, 6 * SECOND):
+                continue
+            x, y, yaw = item.pose[0], item.pose[1], 2 * np.arctan2(item.pose[5], item.pose[6])
+            if item.stamp == 2 * SECOND:
+                form, value, noise = "position", np.array([3.0 - x, 4.0 - y, 0.0]), np.diag([0.01] * 3)
+            else:
+                form, noise = "bearing", np.diag([1e-4, 1e-4])
+                value = np.array([np.arctan2(4.0 - y, 3.0 - x) - yaw, 0.0])
+            yield LandmarkObservation(item.stamp, "landmark", "", "tree", form, value, noise)
+
+    backend = driven(sightings())
+    ids = [id_ for id_, factor in backend.solver.factors.items() if factor.kind == "landmark"]
+    assert len(ids) == 2
+    before = poses(backend)
+    with pytest.raises(SlamError, match="do not hold every pose and landmark"):
+        backend.dry_run("edit", {"disable": ids[:1]})
+    (decision,) = asked(backend, disable=ids[:1])
+    assert decision.verdict == "refused"
+    assert set(ids) <= backend.solver.factors.keys()
+    assert poses(backend).tobytes() == before.tobytes()
+    assert asked(backend, disable=ids)[-1].verdict == "accepted"
+    assert backend.snapshot().names == ()
+
+
 def seeing(items):
     """A tree at (3, 4), seen from three places."""
     noise = np.diag([0.01, 0.01, 0.01])

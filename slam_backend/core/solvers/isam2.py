@@ -82,11 +82,14 @@ class Isam2:
 
     def restart(self, factors: Iterable[Factor], values: gtsam.Values) -> Estimate:
         held, qr = {factor.id: factor for factor in factors}, self._qr
+        gone = [factor for id_, factor in self.factors.items() if held.get(id_) is not factor]
         try:
-            self._isam, self._slots = self._climb(list(held.values()), values)
+            isam, slots = self._climb(list(held.values()), values)
+            _check_held(isam, (key for factor in gone for key in factor.keys if isam.valueExists(key)))
         except _Failures as error:
             self._qr = qr
             raise SolverFailure(_short(error), ()) from None
+        self._isam, self._slots = isam, slots
         self.factors.clear()  # others hold on to the store itself
         self.factors.update(held)
         return self._believed
@@ -119,13 +122,7 @@ class Isam2:
             )
             if not all(map(isfinite, found)):
                 raise RuntimeError(f"estimate is not finite near variable {gtsam.DefaultKeyFormatter(key)}")
-        self._check_held(delta)
-
-    def _check_held(self, delta: Delta) -> None:
-        """What a removed factor held must be held by others: rounding can hide from both factorizations that it is not."""
-        for key in {key for id_ in delta.remove for key in self.factors[id_].keys}:
-            if not np.diag(self._isam.marginalCovariance(key)).max() < AFLOAT:
-                raise RuntimeError(f"nothing holds variable {gtsam.DefaultKeyFormatter(key)}")
+        _check_held(self._isam, (key for id_ in delta.remove for key in self.factors[id_].keys))
 
     def _commit(self, delta: Delta) -> None:
         for id_ in delta.remove:
@@ -152,7 +149,7 @@ class Isam2:
             self._qr = qr or self._config.factorization == "auto"
             try:
                 self._isam, self._slots = self._climb(list(self._after(delta)), values)
-                self._check_held(delta)
+                _check_held(self._isam, (key for id_ in delta.remove for key in self.factors[id_].keys))
             except _Failures:
                 guilty = self._unsolvable(delta, before)
             else:
@@ -292,6 +289,13 @@ class Believed:
         except _Failures as error:
             raise SolverFailure(_short(error), ()) from None
         return np.block([[joint.at(i, j) for j in keys] for i in keys])
+
+
+def _check_held(isam: gtsam.ISAM2, keys: Iterable[int]) -> None:
+    """What a removed factor held must be held by others: rounding can hide from both factorizations that it is not."""
+    for key in set(keys):
+        if not np.diag(isam.marginalCovariance(key)).max() < AFLOAT:
+            raise RuntimeError(f"nothing holds variable {gtsam.DefaultKeyFormatter(key)}")
 
 
 def _graph(factors: Iterable[Factor]) -> gtsam.NonlinearFactorGraph:
