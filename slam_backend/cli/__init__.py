@@ -26,6 +26,7 @@ VERBS: Mapping[
     "play": "A bag's messages to real topics.",
     "journal": "A node's journal: what it holds, whether it is whole, as a bag.",
     "solve": "The optimum of a pose graph.",
+    "stress": "How many wrong loops a recorded run withstands.",
     "dataset": "A public data set that ships with gtsam, as a bag.",
     "simulate": "A world with ground truth, as a bag.",
     "convert": "A pose graph or trajectory from one format to another.",

@@ -122,7 +122,7 @@ class Pcm(Section):
         20_000,
         ge=1,
         le=100_000_000,
-        description="loops tried in the search for one new loop; beyond, it is not exact",
+        description="loops looked at in the search for one new loop; beyond, it is not exact",
     )
 
 
@@ -162,7 +162,7 @@ class Rrr(Section):
     gap: float = Field(
         10.0, ge=0, le=1e6, description="m of odometry between neighbours in a cluster, at each end"
     )
-    every: int = Field(200, ge=1, le=1_000_000, description="keyframes from one judgment to the next")
+    every: int = Field(500, ge=1, le=1_000_000, description="keyframes from one judgment to the next")
     lag: int = Field(
         50, ge=1, le=1_000_000, description="keyframes from the begin of a judgment to its landing"
     )

@@ -43,10 +43,11 @@ class Wrongs:
         self._taken = {frozenset(each.ends) for each in like}
 
     def loops(self, count: int, size: int = 1) -> list[RelativePose]:
-        """At most `count` loops, ordered by stamp, in groups of `size`; fewer where the drive has no room for them."""
+        """About `count` loops, ordered by stamp, in whole groups of `size`; fewer where the drive has no room for them."""
         made: list[RelativePose] = []
-        for _ in range(DRAWS * count):
-            if len(made) + size > count:
+        groups = max(1, round(count / size)) if count else 0
+        for _ in range(DRAWS * groups):
+            if len(made) == groups * size:
                 break
             group = self._single() if size == 1 else self._group(size)
             ends = {frozenset(each.ends) for each in group}
@@ -133,15 +134,12 @@ class Injected:
     def __init__(self, inputs: Inputs, loops: Sequence[RelativePose]) -> None:
         self._inputs, self._loops = inputs, loops
         self.count = inputs.count + len(loops)
+        self.read = 0
         self._given = 0
 
     @property
     def paths(self) -> Sequence[Path]:
         return self._inputs.paths
-
-    @property
-    def read(self) -> int:
-        return self._inputs.read + self._given
 
     @property
     def damage(self) -> list[str]:
@@ -151,6 +149,7 @@ class Injected:
         for item in self._inputs.stream(config):
             if not isinstance(item, Decision) and item.source == config.driver:
                 yield from self._due(item)
+            self.read = self._inputs.read + self._given
             yield item
         yield from self._due(None)
 
@@ -160,6 +159,7 @@ class Injected:
             if item is not None and loop.stamp >= item.stamp:
                 return
             self._given += 1
+            self.read = self._inputs.read + self._given
             yield loop
 
     def vertex(self, stamp: int) -> int | None:

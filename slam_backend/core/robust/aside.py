@@ -76,8 +76,12 @@ class Aside:
 
     def _begun(self, estimate: Estimate) -> Judgment:
         self._new = False
+        """From odometry, not from the estimate: that is bent by the verdicts so far, and would repeat them."""
+        from ..solvers.initialize import initialize
+
         others = [factor for id_, factor in self._paths.factors.items() if id_ not in self._loops]
-        return self._judge(others, tuple(self._loops.values()), estimate.values())
+        loops = tuple(self._loops.values())
+        return self._judge(others, loops, initialize([*others, *loops], estimate.values(), "odometry").values)
 
     @staticmethod
     def _advanced(work: Work, to_the_end: bool) -> Mapping[str, Opinion] | None:

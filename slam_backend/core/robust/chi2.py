@@ -1,7 +1,7 @@
 """Chi-square: how large a squared Mahalanobis distance may be by chance."""
 
 from functools import cache
-from math import erf, exp, gamma, sqrt
+from math import erf, exp, lgamma, log, sqrt
 
 
 def chi2_below(value: float, dof: int) -> float:
@@ -9,7 +9,7 @@ def chi2_below(value: float, dof: int) -> float:
     half = value / 2
     found, n = (erf(sqrt(half)), 1) if dof % 2 else (1 - exp(-half), 2)
     while n < dof:
-        found -= half ** (n / 2) * exp(-half) / gamma(n / 2 + 1)
+        found -= exp(n / 2 * log(half) - half - lgamma(n / 2 + 1)) if half > 0 else 0.0
         n += 2
     return found
 

@@ -10,7 +10,7 @@ from collections.abc import Iterator
 
 class LargestClique:
     def __init__(self, steps: int) -> None:
-        """steps: vertices that the search for one new vertex may try."""
+        """steps: vertices that the search for one new vertex may colour, which is where its time goes."""
         self._steps = steps
         self._beside: list[int] = []
         self.members: frozenset[int] = frozenset()
@@ -41,15 +41,17 @@ class LargestClique:
         """One of that size among the bits of `among`; None if there is none, or none was found in time."""
         if size == 0:
             return ()
+        self._left -= among.bit_count()
+        if self._left < 0:
+            return None
         for v, colours in reversed(self._coloured(among)):
             if colours < size:
                 return None  # what is left has too few colours
-            self._left -= 1
-            if self._left < 0:
-                return None
             found = self._clique(among & self._beside[v], size - 1)
             if found is not None:
                 return (*found, v)
+            if self._left < 0:
+                return None
             among &= ~(1 << v)
         return None
 

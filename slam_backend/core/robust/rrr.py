@@ -21,7 +21,7 @@ from .chi2 import chi2_quantile
 from .paths import Paths
 from .soft import plain
 
-ITERATIONS = 10  # of each solution: a verdict needs no digits
+ROUGH = Options(iterations=10, relative=1e-3)  # a verdict needs no digits
 CONFIDENCE = 0.95  # of every chi-square test
 
 Cluster = tuple[Factor, ...]
@@ -91,7 +91,8 @@ class Problem:
     """Odometry, and whichever loops are asked about. Solutions are generators: a step is one of them."""
 
     def __init__(self, others: Sequence[Factor], values: gtsam.Values, paths: Paths) -> None:
-        self._others, self._values, self._paths = others, values, paths
+        self._others, self._start, self._paths = others, values, paths
+        self._values = values  # the last solution of all: the next one is near
 
     def limit(self, loops: int) -> float:
         return chi2_quantile(CONFIDENCE, loops * self._paths.space.dimension)
@@ -137,14 +138,18 @@ class Problem:
 
     def solved(self, loops: Sequence[Factor], others: Sequence[Factor] | None = None) -> Step:
         """chi2 of each loop, and of all odometry under the name of "": with the loops, at their optimum."""
-        others = self._others if others is None else others
-        factors = [*others, *loops]
-        found = layout(factors, self._values)
-        touched = found.touched(self._values)
+        whole = others is None
+        start = self._values if whole else self._start
+        factors = [*(self._others if others is None else others), *loops]
+        found = layout(factors, start)
+        touched = found.touched(start)
         held = gauges(factors, found, touched, self._paths.space)
-        descent = Descent([*factors, *held], touched, Options(iterations=ITERATIONS))
+        descent = Descent([*factors, *held], touched, ROUGH)
         descent.run()
         yield
+        if whole:
+            self._values = gtsam.Values(start)
+            self._values.update(descent.values)
         chi2 = {loop.id: 2 * float(loop.factor.error(descent.values)) for loop in loops}
         return chi2 | {"": 2 * descent.cost - sum(chi2.values())}
 

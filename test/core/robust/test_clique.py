@@ -58,7 +58,7 @@ def test_what_is_the_largest_so_far_stays_until_something_larger_comes():
 
 def test_beyond_its_bound_of_work_it_says_that_it_is_not_exact_and_still_is_a_clique():
     matrix = random_graph(60, 0.7, seed=3)
-    clique = grown(matrix, steps=3)
+    clique = grown(matrix, steps=100)
     assert not clique.exact
     assert all(matrix[u, v] for u, v in combinations(sorted(clique.members), 2))
     assert len(clique.members) <= len(grown(matrix).members)
