@@ -14,6 +14,11 @@ from slam_backend.core.space import SPACES
 
 ROUND = 60  # keyframes
 SIGMA = 0.02
+FIRST = 1000  # s: stamp of keyframe 0
+
+
+def vertex(stamp: int) -> int:
+    return stamp // SECOND - FIRST
 
 
 @dataclass
@@ -27,12 +32,12 @@ class Ended:
     def kept(self) -> set[tuple[int, int]]:
         """Ends (keyframes) of the loops in the graph."""
         loops = [f for f in self.backend.solver.factors.values() if f.kind == "loop"]
-        return {tuple(stamp // SECOND for stamp in loop.stamps) for loop in loops}
+        return {tuple(map(vertex, loop.stamps)) for loop in loops}
 
     @property
     def last(self) -> dict[tuple[int, int], Decision]:
         """The last decision about each loop."""
-        return {tuple(s // SECOND for s in d.ends): d for d in self.decisions if d.ends}
+        return {tuple(map(vertex, d.ends)): d for d in self.decisions if d.ends}
 
 
 class Drive:
@@ -71,13 +76,13 @@ class Drive:
 
     def _edge(self, i: int, j: int, pose: object) -> RelativePose:
         information = frozen(np.eye(self.space.dimension) / SIGMA**2)
-        stamps = i * SECOND, j * SECOND
+        stamps = (FIRST + i) * SECOND, (FIRST + j) * SECOND
         seven, unstated = frozen(self.space.seven(pose)), frozen(np.zeros(36))
         return RelativePose(max(stamps), "edges", *stamps, "", "", seven, unstated, information)
 
 
 def ends(loops: list[RelativePose]) -> set[tuple[int, int]]:
-    return {(loop.stamp_i // SECOND, loop.stamp_j // SECOND) for loop in loops}
+    return {tuple(map(vertex, loop.ends)) for loop in loops}
 
 
 @pytest.fixture(params=["2d", "3d"])
