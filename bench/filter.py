@@ -17,12 +17,12 @@ from slam_backend.lab.simulate import Options, simulate, write_simulation
 
 TITLE = "The smoother beside a filter"
 EXPLANATION = (
-    "Twenty simulated drives of 500 poses each, with loops (the warehouse has landmarks too); median ATE in m after rigid alignment. "
+    "Ten simulated drives of 500 poses each, with loops (the warehouse has landmarks too); median ATE in m after rigid alignment. "
     f"Baseline: an extended Kalman filter with landmarks and the newest {CLONES} keyframes in its state, over the same factors "
     "(`replay --estimator ekf`). `at the time`: what was believed of each keyframe when it was newest."
 )
 OPTIONS = Options(poses=500, loop_rate=0.5)
-SEEDS = 20
+SEEDS = 10
 
 
 def rows() -> list[Row]:

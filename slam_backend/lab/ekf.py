@@ -8,7 +8,7 @@ a late sighting) cannot be used, and is refused with a decision.
 
 A factor with unknown variables that it determines (motion, a first sighting, an absolute pose) makes them: whitened,
 A_k dx_k + A_u dx_u = b + n with unit n gives their mean and covariance. All others of the same change are one correction.
-Covariances stand at the tangents of gtsam's variables, poses at the child (right-invariant error).
+Covariances stand at the tangents of gtsam's variables, poses at the child: x Exp(dx).
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
