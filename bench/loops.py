@@ -145,24 +145,39 @@ def injected(name: str, share: float, size: int = 1, seed: int = 1) -> Case | No
         return None
     whole = read_graph(path)
     graph = replace(whole, edges=_only(whole.edges, np.arange(len(whole.edges)) < len(whole.edges) - last))
-    truth, true, stamps = _optimum(problem_of(graph)), loops_of(graph), graph.stamps_at()
-    ends = {
-        (int(stamps[i]), int(stamps[j]))
-        for i, j in zip(graph.edges.i[true], graph.edges.j[true], strict=True)
-    }
-    recorded = [each for each in measurements(graph) if isinstance(each, RelativePose) and each.ends in ends]
+    truth, recorded = _optimum(problem_of(graph)), _recorded(graph, loops_of(graph))
     made = Wrongs(truth, recorded, SPACES[graph.space], seed).loops(wanted(share, len(recorded)), size)
-    edges = _with(graph, made)
-    padding = np.zeros(len(made), dtype=np.bool_)
-    wrong = np.concatenate([np.zeros_like(true), ~padding])
     kind = "" if size == 1 else f" in groups of {size}"
-    return Case(
-        f"{name}, {share:.0%} wrong{kind}",
-        replace(graph, edges=edges),
-        np.concatenate([true, padding]),
-        wrong,
-        truth,
-    )
+    return _added(f"{name}, {share:.0%} wrong{kind}", graph, made, truth)
+
+
+def aliased(
+    sequence: str, groups: int, size: int, seed: int = 1
+) -> tuple[Case, list[list[RelativePose]]] | None:
+    """Real visual odometry and its true loops, with groups of wrong ones that agree with each other; None without the data."""
+    case = next(vo_loops((sequence,), ("0.15",), (None,)), None)
+    if case is None:
+        return None
+    graph = case.clean
+    true = loops_of(graph)
+    wrongs = Wrongs(case.truth, _recorded(graph, true), SPACES[graph.space], seed)
+    made = [wrongs.loops(size, size) for _ in range(groups)]
+    every = [loop for group in made for loop in group]
+    return _added(f"KITTI {sequence}, {groups} groups of {size}", graph, every, case.truth), made
+
+
+def _recorded(graph: PoseGraph, true: Mask) -> list[RelativePose]:
+    """Those edges as the measurements that they are."""
+    stamps, edges = graph.stamps_at(), graph.edges
+    ends = {(int(stamps[i]), int(stamps[j])) for i, j in zip(edges.i[true], edges.j[true], strict=True)}
+    return [each for each in measurements(graph) if isinstance(each, RelativePose) and each.ends in ends]
+
+
+def _added(name: str, graph: PoseGraph, made: list[RelativePose], truth: Trajectory) -> Case:
+    """A case of a graph whose loops are true, and of wrong ones after them."""
+    true, more = loops_of(graph), np.zeros(len(made), dtype=np.bool_)
+    wrong = np.concatenate([np.zeros_like(true), ~more])
+    return Case(name, replace(graph, edges=_with(graph, made)), np.concatenate([true, more]), wrong, truth)
 
 
 def loops_of(graph: PoseGraph) -> Mask:

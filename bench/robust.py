@@ -14,10 +14,13 @@ from typing import Any
 
 import numpy as np
 
-from bench.loops import GRAPHS, Case, injected, vo_loops
-from bench.strategies import Found, ours, strategies
+from bench.loops import GRAPHS, Case, aliased, injected, vo_loops
+from bench.strategies import Found, ours, played, strategies
 from bench.table import Row, markdown
+from slam_backend.core.backend import Backend
 from slam_backend.core.config import Config
+from slam_backend.core.robust.chi2 import chi2_quantile
+from slam_backend.core.sensors.relative import RelativePose
 
 TITLE = "Wrong loops"
 EXPLANATION = (
@@ -28,6 +31,7 @@ EXPLANATION = (
 PAGE = Path(__file__).parents[1] / "docs/robust.md"
 BEGIN, END = "<!-- measured: begin -->", "<!-- measured: end -->"
 FRAMES = 50  # keyframes after which a loop that waited must have entered
+GROUPS, SIZE = 45, 5  # of wrong loops that agree, in each of two drives
 SHARES = (0.0, 0.1, 0.3, 0.5)
 SUBSET: dict[str, Any] = {"alphas": ("0.15",), "seeds": (None, 1)}
 Results = dict[str, dict[str, Found]]  # strategy -> case -> what came of it
@@ -42,7 +46,7 @@ def rows(whole: bool = False) -> list[Row]:
     found += _alone(list(vo_loops(("07",), **some)))
     for name, bound in (("intel", "<= 0.05"), ("M3500", "<= 0.2")):
         found += _random(name, bound)
-    return found
+    return found + list(_aliasing())
 
 
 def _promised(sequence: str, these: list[Case]) -> Iterator[Row]:
@@ -117,8 +121,50 @@ def _random(name: str, bound: str) -> Iterator[Row]:
             yield Row(f"{case.name}: verdict, p99", f"{run.p99:.1f} ms", "", run.p99, "<= 80")
 
 
+GROUPS, SIZE = 45, 5  # of wrong loops that agree, in each of two drives
 SHARES = (0.0, 0.1, 0.3, 0.5)
 Results = dict[str, dict[str, Found]]  # strategy -> case -> what came of it
+
+
+def _aliasing() -> Iterator[Row]:
+    """Groups of wrong loops that agree with each other, at random places of two drives."""
+    within: list[bool] = []  # of each group inside the noise of the odometry: whether any of it was ever kept
+    beyond: list[bool] = []
+    for sequence in ("00", "05"):
+        if (made := aliased(sequence, GROUPS, SIZE)) is None:
+            return
+        case, groups = made
+        backend, tally, *_ = played(case, {})
+        kept = {frozenset(loop.ends) for loop in tally.loops.values() if loop.entered is not None}
+        for group in groups:
+            entered = any(frozenset(loop.ends) in kept for loop in group)
+            (beyond if _contradicted(backend, group) else within).append(entered)
+    name = f"KITTI 00 and 05, groups of {SIZE} wrong loops that agree"
+    yield Row(
+        f"{name}, where odometry contradicts them: accepted",
+        f"{sum(beyond)} of {len(beyond)}",
+        "",
+        sum(beyond),
+        "<= 0",
+    )
+    rate = sum(within) / max(len(within), 1)
+    yield Row(
+        f"{name}, inside its noise: accepted", f"{sum(within)} of {len(within)}", "nobody can tell", rate
+    )
+
+
+def _contradicted(backend: Backend, group: list[RelativePose]) -> bool:
+    """Whether a loop of the group is beyond the noise of the odometry between its ends, scaled as the gate has it."""
+    gate, space, paths = backend.config.gate, backend.space, backend._paths  # noqa: SLF001
+    limit = chi2_quantile(gate.probability, space.dimension)
+    for loop in group:
+        a, b = (backend.timeline.at(stamp).pose for stamp in loop.ends)
+        path = paths.along(a, b)
+        away = space.logmap(path.pose.between(space.pose(loop.pose.tolist())))
+        covariance = path.covariance(gate.odometry_scale) + np.linalg.inv(space.information(loop.information))
+        if away @ np.linalg.solve(covariance, away) > limit:
+            return True
+    return False
 
 
 def cases(whole: bool) -> Iterator[Case]:

@@ -4,7 +4,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from math import nan
 from time import perf_counter, process_time
-from typing import Any
+from typing import Any, NamedTuple
 
 import gtsam
 import numpy as np
@@ -66,26 +66,37 @@ class Timed:
             self._watch.append(perf_counter() - begin)
 
 
-def ours(case: Case, settings: dict[str, Any]) -> Found:
-    """One run over the graph as if live, as `replay` does it; CPU without reading and without the last polish."""
-    config = config_from(
-        {"space": case.graph.space, "sources": ["edges"], "edges": {"kind": "relative"}, **settings}
-    )
-    backend, tally = Backend(config), Tally(case.label)
+class Played(NamedTuple):
+    """A run over a case as if live. seconds: CPU without reading and without the last polish. latencies: of verdicts, ms."""
+
+    backend: Backend
+    tally: Tally
+    seconds: float
+    latencies: list[float]
+
+
+def played(case: Case, settings: dict[str, Any]) -> Played:
+    """As `replay` does it."""
+    sources = {"sources": ["edges"], "edges": {"kind": "relative"}}
+    backend = Backend(config_from({"space": case.graph.space, **sources, **settings}))
+    run = Played(backend, Tally(case.label), 0.0, [])
     watch: list[float] = []
     backend._robust = [Timed(stage, watch) for stage in backend._robust]  # noqa: SLF001  # the watch is no part of the product
-    stream = list(measurements(case.graph))
-    latencies: list[float] = []
     seconds = 0.0
-    for each in [*stream, None]:
+    for each in [*measurements(case.graph), None]:
         watch.clear()
         begin = process_time()
         updates = backend.finish() if each is None else backend.add(each)
         seconds += process_time() - begin
         for update in updates:
-            tally.take(update.decisions, len(backend.timeline))
+            run.tally.take(update.decisions, len(backend.timeline))
         if any(decision.ends for update in updates for decision in update.decisions):
-            latencies.append(sum(watch) * 1e3)
+            run.latencies.append(sum(watch) * 1e3)
+    return run._replace(seconds=seconds)
+
+
+def ours(case: Case, settings: dict[str, Any]) -> Found:
+    backend, tally, seconds, latencies = played(case, settings)
     backend.polish()
     delays = tally.delays
     return Found(

@@ -14,8 +14,9 @@ IN = frozenset({"accepted", "restored"})
 
 @dataclass(slots=True)
 class Loop:
-    """first, entered: how many keyframes there were when it was decided about first, and when it entered first."""
+    """ends: its two stamps (ns). first, entered: how many keyframes there were when it was decided about first, and when it entered first."""
 
+    ends: tuple[int, int]
     label: Label
     first: int
     entered: int | None = None
@@ -39,7 +40,7 @@ class Tally:
         self.wrong_at_most = max(self.wrong_at_most, self._wrong_now)
 
     def _one(self, decision: Decision, ends: tuple[int, int], keyframes: int) -> None:
-        loop = self.loops.setdefault(decision.id, Loop(self.label(ends), keyframes))
+        loop = self.loops.setdefault(decision.id, Loop(ends, self.label(ends), keyframes))
         enters = decision.verdict in IN
         if loop.label == "wrong":
             self._wrong_now += enters - loop.kept
