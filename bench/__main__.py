@@ -8,7 +8,20 @@ from pathlib import Path
 from bench.table import markdown
 from slam_backend.io.replay import versions
 
-BENCHES = ("decode", "overhead", "park", "final", "simulated", "filter", "solve", "query", "robust", "live")
+BENCHES = (
+    "decode",
+    "overhead",
+    "park",
+    "final",
+    "simulated",
+    "filter",
+    "solve",
+    "query",
+    "robust",
+    "live",
+    "journal",
+    "crash",
+)
 PAGE = Path(__file__).parents[1] / "docs/benchmarks.md"
 HEAD = """# Benchmarks
 

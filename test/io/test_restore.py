@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from bench import crash
 from bench.damage import content_of, flip, write
 from slam_backend.core.config import Config, OdometrySource, config_to
 from slam_backend.core.errors import BadFile
@@ -131,3 +132,9 @@ def test_what_is_set_aside_takes_the_next_free_number(tmp_path) -> None:
         assert (tmp_path / f"run-{n}").is_dir()
     assert not (tmp_path / NAME).exists()
     assert not (tmp_path / RUN).exists()
+
+
+@pytest.mark.slow
+def test_whatever_is_killed_and_when_nothing_acknowledged_is_lost(tmp_path) -> None:
+    """Process, worker or both, ten times in each of two drives; these end with the hash of their replay."""
+    assert [(row.what, row.value) for row in crash.rows(kills=20) if not row.holds] == []
