@@ -38,7 +38,7 @@ from .robust import ROBUST, Robust
 from .robust.paths import Paths
 from .sensors import SENSORS
 from .sensors.odometry import OdometryPose
-from .sessions import SavedMap, Tracks, joined
+from .sessions import SavedMap, Tracks, fits, joined
 from .settle import FAR
 from .solvers import SOLVERS, Solver
 from .space import SPACES
@@ -116,8 +116,7 @@ class Backend:
         """Go on in a saved map: what comes is a part of its own, until a measurement joins it to the map. SlamError if it cannot be."""
         if len(self.timeline):
             raise SlamError("a map can be loaded only before the first keyframe: reset first")
-        if saved.space != self.space.name:
-            raise SlamError(f"the map was made in space {saved.space}, and this is space {self.space.name}")
+        fits(saved, self.space.name)
         self._applier.load(saved)
         for each in saved.keyframes:
             self.timeline.add(each)

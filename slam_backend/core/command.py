@@ -18,6 +18,7 @@ from .measurement import Decoder, Measurement, Message
 TOPIC = "/slam_backend/command"
 TYPE = "std_msgs/msg/String"
 VERSION = 1
+LOAD = "load"  # the action that begins a session in a saved map; arguments: `run` beside the journal, and its `run_hash`
 FIELDS: Mapping[str, type] = {"version": int, "id": str, "action": str, "arguments": dict}
 
 

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 import gtsam
 import numpy as np
 
+from .errors import SlamError
 from .graph import Factor, Keyframe
 from .keyframes import Samples, Track
 from .measurement import Array
@@ -38,6 +39,12 @@ class SavedMap:
         """Its newest stamp; a session that goes on must be later."""
         samples = max((int(track.stamps[-1]) for track in self.tracks if len(track.stamps)), default=0)
         return max(samples, *(k.stamp for k in self.keyframes))
+
+
+def fits(saved: SavedMap, space: str) -> None:
+    """SlamError where a map is of another space."""
+    if saved.space != space:
+        raise SlamError(f"the map was made in space {saved.space}, and this is space {space}")
 
 
 class Tracks:

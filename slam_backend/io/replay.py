@@ -15,7 +15,7 @@ import numpy as np
 
 from ..core.backend import Backend, Update
 from ..core.check import checked, rechecked
-from ..core.command import Command
+from ..core.command import LOAD, Command
 from ..core.config import Config, config_from, config_hash, config_to
 from ..core.decisions import DecisionLog
 from ..core.errors import BadFile, SlamError
@@ -207,6 +207,8 @@ class Run:
                 return
             if isinstance(item, Decision):
                 self.decisions.add(item)
+            elif isinstance(item, Command) and item.action == LOAD:
+                self._load(item)
             elif item.stamp > until and not isinstance(item, StaticTransform):
                 return
             elif item.stamp <= self._begins and item.source == self.config.driver:
@@ -214,6 +216,19 @@ class Run:
             else:
                 yield from self._apply(item)
             self._ahead = None
+
+    def _load(self, asked: Command) -> None:
+        """A session that begins in a saved map: its journal says in which. BadFile if that is not there, or another one is."""
+        folder = Path(self.inputs.paths[0]).parent
+        run = (folder / str(asked.arguments.get("run"))).resolve()
+        if self.continued is None or self.continued.resolve() != run:
+            saved = read_map(run)
+            if saved.run_hash != asked.arguments.get("run_hash"):
+                raise BadFile(
+                    f"{run}: is not the run in whose map {self.inputs.paths[0]} goes on; put that one back"
+                )
+            self.load(run, saved)
+        self.decisions.add(loaded(asked, self._begins))
 
     def _apply(self, item: Measurement) -> Iterator[Update]:
         self.measurements += 1
@@ -352,6 +367,11 @@ class Result:
             "damage": run.inputs.damage,
             "notes": run.notes,
         }
+
+
+def loaded(asked: Command, end: int) -> Decision:
+    basis = {"ends": format_stamp(end)}
+    return Decision(end, f"command/{asked.id}", asked.source, "accepted", "command", LOAD, basis=basis)
 
 
 def _overlapping(item: Measurement, end: int) -> Decision:

@@ -35,7 +35,8 @@ RequestName = Literal["snapshot", "covariance", "dry_run", "save", "finish"]
 @dataclass(frozen=True, slots=True)
 class Report:
     """What changed since the last one. applied: id of the newest row that was read. covariance: of the newest keyframe's pose, 36
-    numbers in ROS order; None without updates, or when it is not determined. update_ms: median and p99.
+    numbers in ROS order; None without updates, or when it is not determined. update_ms: median and p99. reached: the newest stamp (ns)
+    that has been applied.
     """
 
     applied: int
@@ -45,6 +46,7 @@ class Report:
     factors: int
     update_ms: tuple[float, float]
     memory_mb: float
+    reached: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -155,7 +157,9 @@ class _Worker:
             failed = str(error)
         last = self._inputs.last
         if last is None:
-            return  # the node is gone: nobody to tell
+            if failed:
+                self._pipe.send(Failure(failed))
+            return  # else the node is gone: nobody to tell
         self._report()
         self._pipe.send(Answer(last.id, error=failed) if failed else self._inputs.answered(last))
 
@@ -172,6 +176,7 @@ class _Worker:
             len(self._run.backend.solver.factors),
             self._run.seconds.recent(),
             resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
+            self._run.reached,
         )
         self._pipe.send(report)
 

@@ -11,40 +11,44 @@ import signal
 import threading
 from collections.abc import Callable
 from contextlib import suppress
+from itertools import count
 from multiprocessing.connection import Connection
-from queue import SimpleQueue
 
 import numpy as np
 import rclpy
 from geometry_msgs.msg import PoseStamped
 from nav_msgs.srv import GetPlan
+from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
+from rclpy.task import Future
 
-from ..core.errors import BadMessage
-from ..core.measurement import SECOND, Array, stamp_of
+from ..core.errors import BadMessage, SlamError
+from ..core.measurement import SECOND, Array, parse_stamp, stamp_of
 from ..core.trajectory import Snapshot, Stamps
 
 MOST = 50_000  # resampled poses in one answer
 PATIENCE = 0.2  # s between two looks at whether to stop
 PAUSE = 1.0  # s before a process that ended is started anew
 FAREWELL = 1.0  # s that the process may take to leave the network
-Newest = Callable[[], Snapshot | None]
+Believe = Callable[[int | None], Snapshot | None]
 
 
 class Answers:
     """Keeps the process alive and gives it snapshots.
 
-    service: its full name. frame: the frame of the trajectory. newest: called in a thread of its own for each request,
-    may take a moment. log: told in words when the process was lost.
+    service: its full name. frame: the frame of the trajectory. believed: called for each request, with the stamp of an earlier
+    belief (ns; None: the newest), in a thread of its own if it is an earlier one; may take a while. log: told in words when the
+    process was lost.
     """
 
     def __init__(
-        self, service: str, namespace: str, frame: str, newest: Newest, log: Callable[[str], object]
+        self, service: str, namespace: str, frame: str, believed: Believe, log: Callable[[str], object]
     ) -> None:
         self._arguments = (service, namespace, frame)
-        self._newest, self._log = newest, log
+        self._believed, self._log = believed, log
+        self._sending = threading.Lock()
         self._stop = threading.Event()
         self._start()
         self._thread = threading.Thread(target=self._keep, name="answers", daemon=True)
@@ -76,8 +80,12 @@ class Answers:
             try:
                 while not self._stop.is_set():
                     if self._pipe.poll(PATIENCE):
-                        self._pipe.recv_bytes()
-                        _send(self._pipe, self._newest())
+                        asked: tuple[int, int | None] = self._pipe.recv()
+                        if asked[1] is None:
+                            self._tell(self._pipe, *asked)
+                        else:  # others are answered meanwhile
+                            arguments = (self._pipe, *asked)
+                            threading.Thread(target=self._tell, args=arguments, daemon=True).start()
             except (EOFError, OSError):
                 pass
             self._pipe.close()  # by which the process knows its end
@@ -89,20 +97,28 @@ class Answers:
             )
             self._start()
 
+    def _tell(self, pipe: Connection, request: int, stamp: int | None) -> None:
+        try:
+            found: Snapshot | str | None = self._believed(stamp)
+        except SlamError as error:
+            found = str(error)
+        with self._sending, suppress(OSError):  # the process may be gone: then so is its request
+            _send(pipe, request, found)
 
-def _send(pipe: Connection, snapshot: Snapshot | None) -> None:
+
+def _send(pipe: Connection, request: int, found: Snapshot | str | None) -> None:
     """Arrays beside the pickle: they are written without a copy, and without the GIL."""
     buffers: list[pickle.PickleBuffer] = []
-    head = pickle.dumps(snapshot, protocol=5, buffer_callback=buffers.append)
-    pipe.send((head, len(buffers)))
+    head = pickle.dumps(found, protocol=5, buffer_callback=buffers.append)
+    pipe.send((request, head, len(buffers)))
     for buffer in buffers:
         pipe.send_bytes(buffer.raw())
 
 
-def _receive(pipe: Connection) -> Snapshot | None:
-    head, count = pipe.recv()
-    snapshot: Snapshot | None = pickle.loads(head, buffers=[pipe.recv_bytes() for _ in range(count)])  # noqa: S301  # our own process
-    return snapshot
+def _receive(pipe: Connection) -> tuple[int, Snapshot | str | None]:
+    """The number of the request, and a snapshot, or why there is none."""
+    request, head, count = pipe.recv()
+    return request, pickle.loads(head, buffers=[pipe.recv_bytes() for _ in range(count)])  # noqa: S301  # our own process
 
 
 # -- in the process ----------------------------------------------------------------------------------
@@ -126,29 +142,48 @@ def selected(snapshot: Snapshot | None, start: int, goal: int, period: float) ->
     if (last - first) // step >= MOST:
         raise BadMessage(f"a period of {period:g} s makes more than {MOST:,} poses; ask for less")
     wanted = np.arange(first, last + 1, step, dtype=np.int64)
+    wanted = wanted[~snapshot.trajectory.between_sessions(wanted)]
     return wanted, snapshot.at(wanted)
+
+
+def asked_belief(asked: str, frame: str) -> int | None:
+    """The stamp (ns) in `<frame>@<t>`; None for the newest belief. BadMessage for anything else."""
+    name, at, when = asked.partition("@")
+    if name not in ("", frame) or (at and not name):
+        raise BadMessage(f"'{asked}' is not the frame of the trajectory, which is '{frame}'")
+    if not at or when == "now":
+        return None
+    try:
+        return parse_stamp(when)
+    except ValueError as error:
+        raise BadMessage(f"'{asked}': {error}") from None
 
 
 class Server:
     """Answers requests with what the node's process knows."""
 
-    def __init__(self, pipe: Connection, frame: str, warn: Callable[[str], object]) -> None:
-        self._pipe, self._frame, self._warn = pipe, frame, warn
-        self._snapshots: SimpleQueue[Snapshot | None] = SimpleQueue()
+    def __init__(
+        self, pipe: Connection, frame: str, warn: Callable[[str], object], executor: SingleThreadedExecutor
+    ) -> None:
+        self._pipe, self._frame, self._warn, self._executor = pipe, frame, warn, executor
+        self._asked: dict[int, Future] = {}
+        self._numbers = count(1)
         self._pool: list[PoseStamped] = []
 
     def listen(self) -> None:
         """Until the node is gone."""
         try:
             while True:
-                self._snapshots.put(_receive(self._pipe))
+                request, found = _receive(self._pipe)
+                self._asked.pop(request).set_result(found)
+                self._executor.wake()
         except (EOFError, OSError):
-            self._snapshots.put(None)
+            pass
 
-    def answer(self, request: GetPlan.Request, response: GetPlan.Response) -> GetPlan.Response:
+    async def answer(self, request: GetPlan.Request, response: GetPlan.Response) -> GetPlan.Response:
         response.plan.header.frame_id = self._frame
         try:
-            stamps, sevens = self._selected(request)
+            stamps, sevens = await self._selected(request)
         except BadMessage as error:
             self._warn(f"get_trajectory answers nothing: {error}")
             return response
@@ -157,15 +192,16 @@ class Server:
             response.plan.header.stamp = response.plan.poses[-1].header.stamp
         return response
 
-    def _selected(self, request: GetPlan.Request) -> tuple[Stamps, Array]:
-        frame = request.start.header.frame_id
-        if frame.startswith(f"{self._frame}@"):
-            raise BadMessage(f"'{frame}': what was believed at a stamp cannot be asked yet")
-        if frame not in ("", self._frame):
-            raise BadMessage(f"'{frame}' is not the frame of the trajectory, which is '{self._frame}'")
+    async def _selected(self, request: GetPlan.Request) -> tuple[Stamps, Array]:
+        stamp = asked_belief(request.start.header.frame_id, self._frame)
         period = float(str(np.float32(request.tolerance)))  # 0.1 as it was meant, not 0.10000000149
-        self._pipe.send_bytes(b"")
-        return selected(self._snapshots.get(), stamp_of(request.start), stamp_of(request.goal), period)
+        number, answered = next(self._numbers), Future(executor=self._executor)
+        self._asked[number] = answered
+        self._pipe.send((number, stamp))
+        found = await answered
+        if isinstance(found, str):
+            raise BadMessage(found)
+        return selected(found, stamp_of(request.start), stamp_of(request.goal), period)
 
     def _filled(self, stamps: Stamps, sevens: Array) -> list[PoseStamped]:
         """The poses, in objects that are reused: to fill one is several times faster than to make it."""
@@ -192,14 +228,14 @@ def serve(pipe: Connection, service: str, namespace: str, frame: str) -> None:
     node = Node(
         name, namespace=namespace, context=context, use_global_arguments=False, start_parameter_services=False
     )
-    server = Server(pipe, frame, node.get_logger().warning)
-    node.create_service(GetPlan, service, server.answer)
+    executor = SingleThreadedExecutor(context=context)
+    server = Server(pipe, frame, node.get_logger().warning, executor)
+    node.create_service(GetPlan, service, server.answer, callback_group=ReentrantCallbackGroup())
 
     def listen() -> None:
         server.listen()
         context.try_shutdown()
 
-    executor = SingleThreadedExecutor(context=context)
     executor.add_node(node)
     threading.Thread(target=listen, name="listen", daemon=True).start()  # it may be told at once to end
     with suppress(ExternalShutdownException):

@@ -15,12 +15,15 @@ from ..core.query import Known, Unknown
 from ..core.space import SPACES
 from ..core.trajectory import Snapshot, Stamps, Trajectory
 from ..io.feeder import Feeder
+from ..io.historian import Historian, Question
 
 PATIENCE = 5.0  # s that the worker may take to come to a request
 
 
 class Believed:
-    """Implements core.query.Known. feeder: waited for when a covariance is asked; None: no covariance is known."""
+    """Implements core.query.Known. feeder: waited for when a covariance is asked; None: no covariance is known. historian:
+    waited for when something earlier is asked.
+    """
 
     def __init__(
         self,
@@ -28,8 +31,10 @@ class Believed:
         decided: Mapping[str, Decision],
         config: Config,
         feeder: Feeder | None = None,
+        historian: Historian | None = None,
     ) -> None:
         self._snapshot, self._decided, self._feeder = snapshot, decided, feeder
+        self._config, self._historian = config, historian
         self.space = SPACES[config.space]
         driver = config.sources.get(config.driver or "")
         self.noise = driver if isinstance(driver, OdometrySource) else OdometrySource()
@@ -64,4 +69,25 @@ class Believed:
         return None if decision is None else as_json(decision)
 
     def past(self, stamp: int) -> Known:
-        raise Unknown(f"what was believed at {format_stamp(stamp)} cannot be asked yet")
+        if self._historian is None:
+            raise Unknown(f"there is nobody to ask what was believed at {format_stamp(stamp)}")
+        return Remembered(self._historian, stamp, self._config)
+
+
+class Remembered(Believed):
+    """The same session as it was believed at a stamp."""
+
+    def __init__(self, historian: Historian, stamp: int, config: Config) -> None:
+        """Unknown where it never was."""
+        super().__init__(historian.ask(Question("snapshot", stamp)), {}, config, historian=historian)
+        self._asked, self._stamp = historian, stamp
+
+    def covariance(self, index: int) -> Array:
+        try:
+            return np.asarray(self._asked.ask(Question("covariance", self._stamp, str(index))))
+        except SlamError as error:
+            raise SolverFailure(str(error), ()) from None
+
+    def decision(self, identifier: str) -> Mapping[str, Any] | None:
+        found: Mapping[str, Any] | None = self._asked.ask(Question("decision", self._stamp, identifier))
+        return found

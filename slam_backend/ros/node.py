@@ -37,7 +37,7 @@ from .parameters import changed, config_of, declare
 from .pose import Odometer
 from .restoring import Restoring
 from .services import Services
-from .session import Session
+from .session import Begin, Session, empty
 from .snapshots import Snapshots
 from .state import State
 from .steadfast import SteadfastNode, explained, survived
@@ -155,23 +155,23 @@ class BackendNode(SteadfastNode):
                 part.close()
         self._snapshots = self._answering = self._outputs = self._diagnostics = self._intake = None
 
-    def reset(self) -> None:
+    def reset(self, begin: Begin = empty) -> None:
         """A new session: the run so far is saved, its journal set aside, the map starts empty. Takes a while; any thread.
 
-        What is heard meanwhile waits for the new session. SlamError if there can be none.
+        begin: journals what the session begins with. What is heard meanwhile waits for the new session. SlamError if there can be none.
         """
         with self._changing:
             if self._closed.is_set():
                 raise SlamError("there is no session: the node is not configured")
             session, self.session = self.session, None
-            self._renew(session)
+            self._renew(session, begin)
 
-    def _renew(self, ended: Session | None) -> None:
+    def _renew(self, ended: Session | None, begin: Begin = empty) -> None:
         if ended is not None:
             self._end(ended)
         self.state.clear()
         self._odometer = Odometer(self.config)
-        self.session = self._opened(fresh=True)
+        self.session = self._opened(begin, fresh=True)
         self.get_logger().info("a new session has begun")
 
     def _renew_in_background(self, ended: Session | None) -> None:
@@ -200,9 +200,10 @@ class BackendNode(SteadfastNode):
 
     # -- session ---------------------------------------------------------------------------------
 
-    def _opened(self, *, fresh: bool = False) -> Session:
+    def _opened(self, begin: Begin = empty, *, fresh: bool = False) -> Session:
         """Journal and worker. BadFile where the data directory cannot be used."""
         session = Session(self.data_dir, self.state, self.incident, self.config, fresh=fresh)
+        begin(session)
         config = session.config(self.config)
         if session.past is not None:
             self._explain(session.past, config)

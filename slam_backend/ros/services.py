@@ -32,13 +32,16 @@ from ..core.config import Config
 from ..core.errors import BadConfig, BadFile, SlamError
 from ..core.graph import Decision
 from ..core.measurement import Array, format_stamp
-from ..core.query import answers
+from ..core.query import PAST, answers, question
+from ..core.sessions import fits
 from ..core.trajectory import Snapshot
 from ..io.feeder import Feeder
+from ..io.historian import Question
+from ..io.mapfile import read_map
 from .answers import Answers
 from .believed import Believed
 from .editing import edit_in
-from .session import Session
+from .session import Begin, Session, empty
 from .state import State
 
 RUNS = "runs"  # the folder of saved runs, under data_dir
@@ -51,7 +54,6 @@ REVISION = "revision"  # as a name in a query: of the snapshot that answered
 T = TypeVar("T")
 Value = Array | Mapping[str, Any] | int | None
 Content = Mapping[str, Any]
-NOT_YET = "not available yet"
 NO_SESSION = "there is no session: no source has been heard yet"
 
 
@@ -68,7 +70,7 @@ class Services:
         refresh: Callable[[], None],
         data_dir: Path,
         config: Config,
-        reset: Callable[[], None],
+        reset: Callable[[Begin], None],
     ) -> None:
         self._node, self._state, self._data_dir, self._config = node, state, data_dir, config
         self._session_of, self._refresh, self._reset = session_of, refresh, reset
@@ -93,7 +95,7 @@ class Services:
             for name, (type_, callback) in table.items()
         ]
         self._answers = Answers(
-            node.resolve_service_name("~/get_trajectory"), node.get_namespace(), config.map_frame, self.newest,
+            node.resolve_service_name("~/get_trajectory"), node.get_namespace(), config.map_frame, self.believed,
             node.get_logger().error,
         )  # fmt: skip
 
@@ -128,22 +130,38 @@ class Services:
         if any(value is None for value in found.values()):
             with suppress(SlamError):  # then it stays unknown
                 found = await self._elsewhere(
-                    lambda: self._known(request.names, self.newest(), self._feeder_of())
+                    lambda: self._known(request.names, self.newest(), self._session_of())
                 )
         response.values = [_parameter(found[name]) for name in request.names]
         return response
 
     def _known(
-        self, names: Sequence[str], snapshot: Snapshot | None, feeder: Feeder | None
+        self, names: Sequence[str], snapshot: Snapshot | None, session: Session | None
     ) -> dict[str, Value]:
-        """Name -> answer, None where there is none. Without a feeder nothing waits."""
+        """Name -> answer, None where there is none. Without a session nothing waits."""
         found: dict[str, Value] = dict.fromkeys(names)
         if snapshot is None:
             return found
-        known = Believed(snapshot, self._state.decided, self._config, feeder)
+        feeder, historian = (session.feeder, session.historian) if session else (None, None)
+        known = Believed(snapshot, self._state.decided, self._config, feeder, historian)
+        asked: list[str] = []
         for name in found:
-            with suppress(BadConfig):  # no name that could be known
-                found[name] = snapshot.revision if name == REVISION else answers([name], known)[0].value
+            if name == REVISION:
+                found[name] = snapshot.revision
+            else:
+                with suppress(BadConfig):  # no name that could be known
+                    question(name)
+                    asked.append(name)
+        return found | {answer.name: answer.value for answer in answers(asked, known)}
+
+    def believed(self, stamp: int | None) -> Snapshot | None:
+        """The newest snapshot, or what was believed at a stamp. Waits. SlamError where that cannot be told."""
+        if stamp is None:
+            return self.newest()
+        session = self._session_of()
+        if session is None or session.historian is None:
+            raise SlamError(NO_SESSION)
+        found: Snapshot = session.historian.ask(Question("snapshot", stamp))
         return found
 
     def _list(self, request: ListParameters.Request, response: ListParameters.Response) -> Any:
@@ -162,6 +180,7 @@ class Services:
         """Group -> what the name of a member begins with, and how it goes on."""
         snapshot = self._state.snapshot
         decided = list(self._state.decided.values())  # in one step: another thread adds to it
+        revisions = list(self._state.revisions)
         return {
             "decisions": lambda: ("decision/", [d.id for d in decided]),
             "keyframes": lambda: (
@@ -170,7 +189,7 @@ class Services:
             ),
             "landmarks": lambda: ("landmark/", list(snapshot.names) if snapshot else []),
             "loops": lambda: ("decision/", [d.id for d in decided if d.ends is not None]),
-            "revisions": lambda: ("", [REVISION] if snapshot else []),
+            "revisions": lambda: ("", [*[REVISION][: snapshot is not None], *map(_then, revisions)]),
         }
 
     # -- what is to be done ----------------------------------------------------------------------
@@ -221,13 +240,16 @@ class Services:
         return decision
 
     async def _begin_anew(self) -> Content:
+        await self._anew(empty)
+        return {"session": "new"}
+
+    async def _anew(self, begin: Begin) -> None:
         if not self._resetting.acquire(blocking=False):
             raise SlamError("a reset is under way already")
         try:
-            await self._elsewhere(self._reset)
+            await self._elsewhere(lambda: self._reset(begin))
         finally:
             self._resetting.release()
-        return {"session": "new"}
 
     def _pause(self, request: SetBool.Request, response: SetBool.Response) -> Any:
         """Holds for sessions to come, too."""
@@ -259,9 +281,18 @@ class Services:
         told: Content = await self._elsewhere(lambda: feeder.request("dry_run", asked, ACTING))
         return told
 
-    def _load(self, request: LoadMap.Request, response: LoadMap.Response) -> Any:
-        self._node.get_logger().warning(f"load of '{request.map_url}' refused: {NOT_YET}")
-        response.result = LoadMap.Response.RESULT_UNDEFINED_FAILURE
+    async def _load(self, request: LoadMap.Request, response: LoadMap.Response) -> Any:
+        """A new session in the map of a run; what goes wrong is a line of the log, since the type has no room for it."""
+        try:
+            run = inside(self._data_dir, request.map_url)
+            saved = await self._elsewhere(lambda: read_map(run))
+            if self._config.sources:  # else its space is still to be found
+                fits(saved, self._config.space)
+            await self._anew(lambda session: session.begin_in(run, saved.run_hash))
+            response.result = LoadMap.Response.RESULT_SUCCESS
+        except SlamError as error:
+            self._node.get_logger().warning(f"load of '{request.map_url}' refused: {error}")
+            response.result = LoadMap.Response.RESULT_UNDEFINED_FAILURE
         return response
 
     def _survived(self, callback: Callable[[Any, Any], Any]) -> Callable[[Any, Any], Awaitable[Any]]:
@@ -302,6 +333,19 @@ class Services:
         if failure is not None:
             raise failure
         return outcome[0]
+
+
+def inside(data_dir: Path, url: str) -> Path:
+    """The run that a request names. BadFile for what lies outside the data directory, by whatever way."""
+    root = data_dir.resolve()
+    path = (root / url.removeprefix("file://")).resolve()
+    if not url or root not in path.parents:
+        raise BadFile(f"only a run inside {root} can be loaded")
+    return path
+
+
+def _then(stamp: int) -> str:
+    return f"{PAST}{format_stamp(stamp)}/pose@now"
 
 
 def _told(

@@ -1,23 +1,27 @@
 """One journal, and the worker that reads it."""
 
+import os
 import threading
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 from uuid import uuid4
 
-from ..core.command import TOPIC, TYPE, command, text_of
+from ..core.command import LOAD, TOPIC, TYPE, command, text_of
 from ..core.config import Config, config_hash, config_to
 from ..core.errors import BadFile, SlamError
 from ..core.graph import Decision
 from ..core.sensors import SENSORS
 from ..io.encode import encode_string
 from ..io.feeder import Feeder
+from ..io.historian import Historian
 from ..io.inputs import OWN
 from ..io.journal import Journal
 from ..io.replay import versions
 from ..io.restore import RUN, Examination, claim, salvage, set_aside, unfinished
 from .state import State
+
+Begin = Callable[["Session"], object]  # what is journaled before anything is heard
 
 
 class Session:
@@ -48,6 +52,7 @@ class Session:
             raise
         self.journal.note({"event": "resume" if self.past else "begin", "versions": versions()})
         self.feeder: Feeder | None = None
+        self.historian: Historian | None = None
         self._lock, self._ended = threading.Lock(), False
 
     def _taken_up(self, config: Config) -> Examination | None:
@@ -88,10 +93,21 @@ class Session:
                     for source in config.sources.values()
                 }
             )
+            if self.historian is not None:
+                self.historian.close()
+            self.historian = Historian(self.journal.path, config, self._state.reached)
             self.journal.note({"event": "config", "config": config_to(config), "hash": config_hash(config)})
             self._state.expect(self.journal.committed)
             self.feeder = Feeder(self.journal, config, table, self._state.take, self._incident, held)
             self.feeder.pause(self._state.paused)  # as it is by now
+
+    def begin_in(self, run: Path, run_hash: str) -> str:
+        """Journal, before all else, that the session goes on in the map of a run; the id of the decision to come."""
+        asked = command(
+            uuid4().hex, LOAD, {"run": os.path.relpath(run, self._folder.resolve()), "run_hash": run_hash}
+        )
+        self.journal.append(TOPIC, TYPE, encode_string(text_of(asked)))
+        return f"command/{asked.id}"
 
     def command(self, action: str, arguments: Mapping[str, Any], seconds: float) -> Decision:
         """Journal what a person asks, and wait for what came of it. Any thread but the executor's.
@@ -135,6 +151,8 @@ class Session:
         """
         with self._lock:
             self._ended = True
+            if self.historian is not None:
+                self.historian.close()
         self.journal.close({"event": "end"})
         try:
             if self.feeder is None:
@@ -145,3 +163,7 @@ class Session:
             return self.feeder.finish(str(self._folder / RUN), seconds)
         finally:
             self._claim.close()
+
+
+def empty(session: Session) -> None:
+    """A session that begins with an empty map."""

@@ -2,7 +2,7 @@
 
 import threading
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from time import monotonic
 
 from ..core.backend import Update
@@ -13,6 +13,7 @@ from ..io.worker import Report
 
 LOOK = 0.1  # s between two looks at whether to go on waiting
 DECISIONS = 10_000  # the newest that can be asked for by id
+REVISIONS = 1_000  # the newest that are listed
 
 
 class State:
@@ -28,11 +29,15 @@ class State:
         self.decided: dict[str, Decision] = {}
         self.refused: dict[tuple[str, str], int] = {}  # (source, stage/reason) -> count
         self.noted: dict[tuple[str, str], int] = {}  # the same for what the firewall kept, with a remark
+        self.revisions: deque[int] = deque(
+            maxlen=REVISIONS
+        )  # stamps at which the map was noticeably corrected
         self.incidents: deque[tuple[float, str]] = deque(
             maxlen=100
         )  # s on the monotonic clock, what happened
         self.paused = False  # inputs are journaled but not applied; outlasts a session
         self._untold: list[Decision] = []
+        self._revision = 0
         self._unshown = False
         self._newest: tuple[Update, tuple[float, ...] | None] | None = None  # of the worker; perhaps not news
         self._behind = 0  # rows that a new worker has yet to read before its updates are news
@@ -40,6 +45,7 @@ class State:
     def take(self, report: Report) -> None:
         with self._lock:
             self.report = report
+            self._note(report.updates)
             if report.updates:
                 self._newest = report.updates[-1], report.covariance
             if self._newest is not None and report.applied >= self._behind:
@@ -58,6 +64,16 @@ class State:
     def restored(self) -> float:
         """How much of what a new worker has to catch up with it has read; 1 when it is done."""
         return min(self.applied / self._behind, 1.0) if self._behind else 1.0
+    def reached(self) -> int:
+        """The newest stamp (ns) that the worker has applied."""
+        report = self.report
+        return report.reached if report else 0
+
+    def _note(self, updates: Sequence[Update]) -> None:
+        for update in updates:
+            if update.revision != self._revision:
+                self._revision = update.revision
+                self.revisions.append(update.keyframe.stamp)
 
     def decision(self, id_: str, seconds: float, unless: Callable[[], bool]) -> Decision | None:
         """Wait for the decision with that id; None if it did not come in time (s), or something else is true."""
@@ -74,6 +90,8 @@ class State:
         with self._lock:
             self._behind, self._newest = rows, None
             self.decided, self.refused, self.noted, self._untold = {}, {}, {}, []
+            self._revision = 0
+            self.revisions.clear()
 
     def happen(self, what: str, decision: Decision | None = None) -> None:
         """Something went wrong."""
@@ -100,6 +118,8 @@ class State:
         with self._lock:
             self.report = self.update = self.covariance = self.snapshot = None
             self.decided, self.refused, self.noted, self._untold = {}, {}, {}, []
+            self._revision = 0
+            self.revisions.clear()
             self._unshown, self._behind, self._newest = False, 0, None
 
     def untold_decisions(self) -> list[Decision]:

@@ -31,7 +31,7 @@ from slam_backend.io.encode import encode_odometry
 from slam_backend.io.feeder import Feeder
 from slam_backend.io.journal import Journal
 from slam_backend.ros.services import Services
-from slam_backend.ros.session import Session
+from slam_backend.ros.session import Begin, Session, empty
 from slam_backend.ros.snapshots import Snapshots
 from slam_backend.ros.state import State
 
@@ -59,9 +59,10 @@ class Host:
             self.node, self.state, lambda: self.session, snapshots.ask, data_dir, self.config, self.reset
         )
 
-    def begin(self) -> None:
+    def begin(self, begin: Begin = empty) -> None:
         self.sessions += 1
         self.session = Session(self.data_dir / f"session{self.sessions}", self.state, say, self.config)
+        begin(self.session)
         self.session.work(self.config)
 
     @property
@@ -73,10 +74,10 @@ class Host:
         assert self.session.feeder is not None
         return self.session.feeder
 
-    def reset(self) -> None:
+    def reset(self, begin: Begin = empty) -> None:
         self.session.end(30)
         self.state.clear()
-        self.begin()
+        self.begin(begin)
 
     def feed(self) -> None:
         if self.records == "nothing":
@@ -188,6 +189,9 @@ class Client:
             request.parameters.append(parameter)
         result = self.end(self.begin("edit", request, SetParametersAtomically)).result
         return result.successful, json.loads(result.reason)
+
+    def load(self, url: str) -> int:
+        return int(self.end(self.begin("load", LoadMap.Request(map_url=url), LoadMap)).result)
 
     def pause(self, on: bool) -> tuple[bool, Any]:
         return told(self.end(self.begin("pause", SetBool.Request(data=on), SetBool)))
@@ -307,7 +311,8 @@ def test_a_resampled_trajectory_has_the_poses_that_a_query_gives(warehouse) -> N
 @pytest.mark.parametrize(
     "wrong",
     [
-        {"frame": "map@1700000100.000000000"},
+        {"frame": "map@1800000000.000000000"},
+        {"frame": "map@yesterday"},
         {"frame": "odom"},
         {"period": -1.0},
         {"period": float("nan")},
@@ -316,6 +321,30 @@ def test_a_resampled_trajectory_has_the_poses_that_a_query_gives(warehouse) -> N
 )
 def test_what_cannot_be_answered_is_an_empty_plan(warehouse, wrong) -> None:
     assert len(warehouse.trajectory(**wrong)[0]) == 0
+
+
+def test_what_was_believed_earlier_is_that_of_a_replay_which_halts_there(warehouse) -> None:
+    """The trajectory and every name; the present is answered while the past is looked up."""
+    run = sb.replay(BAGS / "warehouse.mcap", sb.load_config(BAGS / "warehouse.yaml"))
+    first = int(warehouse.trajectory()[0][0])
+    for t in (first + 30_000_000_123, first + 15_000_000_000):
+        stamps, poses, _ = warehouse.trajectory(frame=f"map@{format_stamp(t)}")
+        if t == first + 30_000_000_123:
+            assert run.reach(t)
+            believed = run.backend.snapshot()
+            assert np.array_equal(stamps, believed.stamps)
+            assert np.array_equal(poses, believed.trajectory.sevens)
+        assert stamps[-1] == t // 100_000_000 * 100_000_000
+    when = f"map@{format_stamp(first + 30_000_000_123)}"
+    asked = warehouse.begin("query", GetParameters.Request(names=[f"{when}/pose@now#cov"]), GetParameters)
+    now, then, landmark, unknown = warehouse.query(
+        "pose@k5", f"{when}/pose@k5", f"{when}/landmark/{believed.names[0]}", f"{when}/pose@k4000"
+    )
+    assert np.array_equal(then, believed.trajectory.sevens[5])
+    assert not np.array_equal(now, then)
+    assert np.array_equal(landmark, believed.landmarks[0])
+    assert unknown is None
+    assert len(warehouse.end(asked).values[0].double_array_value) == 36
 
 
 def test_what_is_listed_can_be_queried(warehouse) -> None:
@@ -353,6 +382,36 @@ def test_a_map_to_load_is_refused(warehouse) -> None:
     request = LoadMap.Request(map_url="/etc/passwd")
     refused = LoadMap.Response.RESULT_UNDEFINED_FAILURE
     assert warehouse.end(warehouse.begin("load", request, LoadMap)).result == refused
+
+
+def test_a_session_goes_on_in_a_saved_map(host) -> None:
+    """What was saved is there and stays, what is heard next is joined to it, and a replay of the journal does the same."""
+    client = host("slow")
+    until = time.monotonic() + 60
+    while len(client.trajectory()[0]) < 300:
+        assert time.monotonic() < until
+        time.sleep(0.3)
+    saved, content = client.trigger("save")
+    assert saved
+    run = Path(content["run"])
+    (client.folder / "shortcut").symlink_to(client.folder.parent)
+    for wrong in ("", "..", "runs/../..", "/", "shortcut/anywhere", "runs/none", "session1"):
+        assert client.load(wrong) == LoadMap.Response.RESULT_UNDEFINED_FAILURE
+    assert client.load(f"runs/{run.name}") == LoadMap.Response.RESULT_SUCCESS
+    while len(client.trajectory()[0]) < content["keyframes"] + 30:
+        assert time.monotonic() < until + 60
+        time.sleep(0.3)
+    old = np.loadtxt(run / "trajectory.tum")
+    stamps, poses, _ = client.trajectory()
+    assert stamps[: len(old)] == pytest.approx(old[:, 0] * 1e9, abs=1e3)
+    assert poses[: len(old), :3] == pytest.approx(old[:, 1:4], abs=0.5)
+    assert client.trigger("reset")[0]
+    session = client.folder / "session2"
+    summary = json.loads((session / "run/summary.json").read_text())
+    assert summary["counts"]["parts"] == 1
+    assert len(summary["sessions"]) == 2
+    again = sb.replay(session / "journal.db3", sb.load_config(BAGS / "warehouse.yaml")).result.summary
+    assert again["run_hash"] == summary["run_hash"]
 
 
 # -- what is asked of the map ------------------------------------------------------------------------
