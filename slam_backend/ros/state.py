@@ -64,6 +64,7 @@ class State:
     def restored(self) -> float:
         """How much of what a new worker has to catch up with it has read; 1 when it is done."""
         return min(self.applied / self._behind, 1.0) if self._behind else 1.0
+
     def reached(self) -> int:
         """The newest stamp (ns) that the worker has applied."""
         report = self.report
