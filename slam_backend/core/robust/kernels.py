@@ -51,3 +51,8 @@ def with_kernel(noise: Any, config: Observing | None) -> Any:
     if kernel is None or config is None:
         return noise
     return gtsam.noiseModel.Robust.Create(kernel.make(config.kernel_width or kernel.width), noise)
+
+
+def without_kernel(noise: Any) -> Any:
+    """The noise model inside a robust one; a plain one as it is."""
+    return noise.noise() if isinstance(noise, gtsam.noiseModel.Robust) else noise

@@ -18,8 +18,8 @@ from ..solvers.descent import Descent, Options
 from ..solvers.gauges import gauges, layout
 from .aside import Aside, Judgment, Opinion
 from .chi2 import chi2_quantile
+from .kernels import without_kernel
 from .paths import Paths
-from .soft import plain
 
 ROUGH = Options(iterations=10, relative=1e-3)  # a verdict needs no digits
 CONFIDENCE = 0.95  # of every chi-square test
@@ -81,7 +81,7 @@ class Rrr(Aside):
     def _scaled(self, factor: Factor) -> Factor:
         if factor.kind != "motion":
             return factor
-        root = np.asarray(plain(factor).R()) / self._scale**0.5
+        root = np.asarray(without_kernel(factor.factor.noiseModel()).R()) / self._scale**0.5
         noise = gtsam.noiseModel.Gaussian.SqrtInformation(root)
         made = self._paths.space.between(*factor.keys, factor.factor.measured(), noise)
         return Factor(factor.id, factor.kind, made, factor.keys, factor.stamp, factor.stamps)

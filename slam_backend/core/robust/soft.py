@@ -14,6 +14,7 @@ import numpy as np
 
 from ..graph import Decision, Delta, Estimate, Factor, Verdict
 from ..measurement import Array
+from .kernels import without_kernel
 from .paths import Paths
 from .stage import Judged
 
@@ -42,7 +43,7 @@ class Soft:
     def admit(self, proposed: Delta, estimate: Estimate) -> Judged:
         add, decisions = [], []
         for factor in proposed.add:
-            noise = plain(factor)
+            noise = without_kernel(factor.factor.noiseModel())
             robust = gtsam.noiseModel.Robust.Create(self._kernel, noise)
             made = self._paths.space.between(*factor.keys, factor.factor.measured(), robust)
             loop = Loop(replace(factor, factor=made), np.asarray(noise.R()))
@@ -87,9 +88,3 @@ class Soft:
             factor.stamp, factor.id, factor.source, verdict, self._stage, reason,
             f"its weight at the estimate is {weight:.3g}", weight, HALF, factor.stamps,
         )  # fmt: skip
-
-
-def plain(factor: Factor) -> Any:
-    """The noise inside a robust kernel."""
-    noise = factor.factor.noiseModel()
-    return noise.noise() if hasattr(noise, "noise") else noise

@@ -10,7 +10,7 @@ between its two bounds is unsettled, and the schedule must have left its convex 
 """
 
 from collections.abc import Iterable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import gtsam
 import numpy as np
@@ -18,6 +18,7 @@ import numpy as np
 from ..graph import Factor
 from ..measurement import Array
 from ..robust.chi2 import chi2_quantile
+from ..robust.kernels import without_kernel
 from .batch import Solution, Start, solve
 from .descent import Descent, Options, Progress, unwatched
 from .gauges import gauges, layout, space_of
@@ -72,7 +73,7 @@ class Graduation:
         self._sure = [factor for factor in factors if factor.kind != "loop"]
         self._sure += gauges(factors, found, start, self._space)
         self.loops = [factor for factor in factors if factor.kind == "loop"]
-        self._roots = [np.asarray(_plain(factor).R()) for factor in self.loops]
+        self._roots = [np.asarray(without_kernel(f.factor.noiseModel()).R()) for f in self.loops]
         options = options or Options()
         self._options = Options(ordering=options.ordering, iterations=INNER)
         self._progress = progress
@@ -125,9 +126,3 @@ class Graduation:
         noise = gtsam.noiseModel.Gaussian.SqrtInformation(np.sqrt(weight) * root)
         made = self._space.between(*factor.keys, factor.factor.measured(), noise)
         return Factor(factor.id, factor.kind, made, factor.keys, factor.stamp, factor.stamps)
-
-
-def _plain(factor: Factor) -> Any:
-    """The noise inside a robust kernel."""
-    noise = factor.factor.noiseModel()
-    return noise.noise() if hasattr(noise, "noise") else noise

@@ -7,7 +7,14 @@ import numpy as np
 import pytest
 
 from slam_backend.core.config import LandmarkSource, RelativeSource
-from slam_backend.core.robust.kernels import KERNELS, LARGEST_SIGMA, SMALLEST_SIGMA, noise_of, with_kernel
+from slam_backend.core.robust.kernels import (
+    KERNELS,
+    LARGEST_SIGMA,
+    SMALLEST_SIGMA,
+    noise_of,
+    with_kernel,
+    without_kernel,
+)
 
 ERRORS = np.array([0.01, 0.3, 0.9, 1.0, 1.4, 3.0, 10.0])
 UNIT = gtsam.noiseModel.Isotropic.Sigma(1, 1.0)
@@ -83,4 +90,11 @@ def test_a_variance_of_zero_becomes_the_smallest(sigmas):
     assert np.isfinite(noise.R()).all()
     np.testing.assert_allclose(
         np.diag(covariance_of(noise)), np.maximum(sigmas, SMALLEST_SIGMA) ** 2, rtol=1e-6
+    )
+
+
+def test_a_kernel_can_be_taken_off_again():
+    assert without_kernel(UNIT) is UNIT
+    assert not isinstance(
+        without_kernel(with_kernel(UNIT, RelativeSource(kernel="dcs"))), gtsam.noiseModel.Robust
     )
