@@ -328,11 +328,6 @@ def test_nothing_raises_when_the_driving_source_is_spoilt_too(driver: str, space
 
 
 @pytest.mark.slow
-@pytest.mark.xfail(
-    raises=RuntimeError,
-    strict=False,
-    reason="a graph of wrong measurements that iSAM2 cannot be rebuilt from",
-)
 @pytest.mark.parametrize("part", range(10))
 def test_a_hundred_thousand_spoilt_messages(part: int) -> None:
     begin = process_time()

@@ -20,6 +20,7 @@ import numpy as np
 
 from ..config import Config
 from ..errors import SolverFailure
+from ..firewall.rules import FARTHEST
 from ..graph import Decision, Delta, Estimate, Factor, Pose, is_pose
 from ..measurement import Array
 from ..space import Space
@@ -114,14 +115,16 @@ class Isam2:
                     break
 
     def _check(self, delta: Delta) -> None:
-        """Garbage without a throw: what the change adds or joins must be finite."""
+        """Garbage without a throw: what the change adds or joins must be finite, and on this planet."""
         joined = (key for factor in delta.add if factor.kind in JOINING for key in factor.keys)
         for key in {**delta.values, **dict.fromkeys(joined)}:
             found = (
                 self._space.numbers(self._believed.pose(key)) if is_pose(key) else self._believed.point(key)
             )
-            if not all(map(isfinite, found)):
-                raise RuntimeError(f"estimate is not finite near variable {gtsam.DefaultKeyFormatter(key)}")
+            if not all(abs(number) < FARTHEST for number in found):
+                raise RuntimeError(
+                    f"estimate is not finite, or leaves the world, near variable {gtsam.DefaultKeyFormatter(key)}"
+                )
         _check_held(self._isam, (key for id_ in delta.remove for key in self.factors[id_].keys))
 
     def _commit(self, delta: Delta) -> None:
@@ -205,8 +208,8 @@ class Isam2:
             found = isam.calculateBestEstimate()
             step = float(np.abs(values.localCoordinates(found).vector()).max())
             now = graph.error(found)
-            if not (isfinite(step) and isfinite(now)):
-                raise RuntimeError("the rebuilt estimate is not finite")
+            if not (step < FARTHEST and isfinite(now)):
+                raise RuntimeError("the rebuilt estimate is not finite, or leaves the world")
             values = found
             if step < SETTLED or (step >= last and abs(error - now) <= ROUNDING * now):
                 return isam, slots

@@ -99,6 +99,9 @@ BAD = {
     ),
     "an exception": gtsam.CustomFactor(NOISE, [X(3), X(30)], boom),
     "an unknown variable": Between(X(3), X(999), gtsam.Pose2(), NOISE),
+    "a place beyond the world": Between(  # finite, but a metre there is less than the rounding of a double
+        X(3), X(30), gtsam.Pose2(1e20, 0, 0), gtsam.noiseModel.Isotropic.Sigma(3, 1e-12)
+    ),
     "a wrong type": gtsam.BetweenFactorPose3(X(3), X(30), gtsam.Pose3(), gtsam.noiseModel.Unit.Create(6)),
 }
 
