@@ -21,6 +21,7 @@ BENCHES = (
     "live",
     "journal",
     "crash",
+    "soak",
 )
 PAGE = Path(__file__).parents[1] / "docs/benchmarks.md"
 HEAD = """# Benchmarks
