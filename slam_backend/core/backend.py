@@ -51,6 +51,7 @@ SOURCES = {  # of a configuration that names none: one of each kind, by the name
     "landmark": LandmarkSource(),
     "pose": PoseSource(),
 }
+ROUNDS = 4  # of reviews after one keyframe, as long as they change something
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -409,26 +410,34 @@ class Backend:
     def _judge(self, proposed: Delta) -> None:
         self._editor.offered(proposed.add)
         self._admit(proposed, self._robust)
-        for stage in self._robust:
-            amendment, decisions = stage.review(self.estimate)
-            added = {factor.id for factor in amendment.add}
-            self._decisions += [each for each in decisions if each.id not in added]
-            others = [other for other in self._robust if other is not stage]
-            self._admit(amendment, others, {each.id: each for each in decisions if each.id in added})
+        for _ in range(ROUNDS):
+            changed = [self._review(stage) for stage in self._robust]
+            if not any(changed):
+                break
+
+    def _review(self, stage: Robust) -> bool:
+        """Whether it changed anything. What it adds is judged by the others."""
+        amendment, decisions = stage.review(self.estimate)
+        added = {factor.id for factor in amendment.add}
+        self._decisions += [each for each in decisions if each.id not in added]
+        others = [other for other in self._robust if other is not stage]
+        self._admit(amendment, others, {each.id: each for each in decisions if each.id in added})
+        return bool(amendment)
 
     def _admit(
-        self, proposed: Delta, stages: Sequence[Robust], passed: Mapping[str, Decision] | None = None
+        self, proposed: Delta, stages: Sequence[Robust], reviewed: Mapping[str, Decision] | None = None
     ) -> None:
-        """Through the stages, then into the graph. passed: why factors have come so far, by id."""
-        passed = dict(passed or {})
+        """Through the stages, then into the graph. reviewed: by id, why a review lets a factor in; that is what is told."""
+        passed = dict(reviewed or {})
         for stage in stages:
             if not proposed.add:
                 break
             proposed, decisions = stage.admit(proposed, self.estimate)
             kept = {factor.id for factor in proposed.add}
             for each in decisions:
-                before = passed.get(each.id)
-                told = replace(each, basis={**before.basis, **each.basis}) if before else each
+                before = passed.get(each.id, each)
+                last = before if reviewed and each.id in kept else each
+                told = replace(last, basis={**before.basis, **each.basis})
                 if each.id in kept:
                     passed[each.id] = told
                 else:

@@ -104,10 +104,51 @@ class Gate(Section):
     """Refuses a loop that contradicts the cheapest path between its ends, through odometry and accepted loops."""
 
     odometry_scale: float = Field(
-        3.0,
+        10.0,
         gt=0,
-        le=1000,
-        description="what the odometry's standard deviations are multiplied by: stated noise leaves out bias and correlation",
+        le=10_000,
+        description="what the odometry's covariance is multiplied by: stated noise leaves out bias and correlation in time",
+    )
+    probability: float = Field(
+        0.999, gt=0, lt=1, description="with which a true loop passes, if all noise is as stated and scaled"
+    )
+    drift: float = Field(
+        0.1,
+        gt=0,
+        le=10,
+        description="m of drift per m of path that odometry never exceeds, whatever its covariance; twice that, in rad, of heading",
+    )
+
+
+class Witness(Section):
+    """Keeps a far loop on probation until others agree with it over short odometry (PCM: Mangelson et al., ICRA 2018)."""
+
+    others: int = Field(
+        2, ge=1, le=20, description="loops that must agree with a far one, and with each other"
+    )
+    near: float = Field(
+        3.0,
+        ge=0,
+        le=1e6,
+        description="m: a loop needs no witness where odometry and accepted loops already say to within this where it ends",
+    )
+    reach: float = Field(
+        60.0, gt=0, le=1e6, description="m of odometry, both ends together, over which two loops are compared"
+    )
+    apart: float = Field(
+        1.0,
+        ge=0,
+        le=1e6,
+        description="m of odometry, both ends together, below which two loops are the same evidence",
+    )
+    lone: float = Field(
+        0.0,
+        ge=0,
+        lt=1,
+        description="a far loop enters without witnesses if it lies within this probability of where it is expected; 0: never",
+    )
+    held: int = Field(
+        2000, ge=1, le=1_000_000, description="loops kept on probation; the oldest of more is refused"
     )
 
 
@@ -276,13 +317,15 @@ class Config(Section):
     settle: Settle = Settle()
     isam2: Isam2 = Isam2()
     gate: Gate = Gate()
+    witness: Witness = Witness()
     pcm: Pcm = Pcm()
     gnc: Gnc = Gnc()
     switchable: Switchable = Switchable()
     max_mixture: MaxMixture = MaxMixture()
     rrr: Rrr = Rrr()
     robust: tuple[StageName, ...] = Field(
-        (), description="what judges loops before they enter the graph, in this order; empty: nothing does"
+        ("gate", "witness"),
+        description="what judges loops before they enter the graph, in this order; empty: nothing does",
     )
     map_frame: str = Field(
         "map", description="name of the frame of the optimized trajectory, in what the node publishes"

@@ -9,6 +9,7 @@ robust kernels, which act per source.
 from collections.abc import Callable, Mapping
 
 from ..config import Config, StageName
+from .gate import Gate
 from .gnc import Gnc
 from .max_mixture import MaxMixture
 from .paths import Paths
@@ -16,10 +17,13 @@ from .pcm import Pcm
 from .rrr import Rrr
 from .stage import Judged, Robust
 from .switchable import Switchable
+from .witness import Witness
 
 __all__ = ["ROBUST", "Judged", "Paths", "Robust"]
 
 ROBUST: Mapping[StageName, Callable[[Config, Paths], Robust]] = {
+    "gate": Gate,
+    "witness": Witness,
     "pcm": Pcm,
     "gnc": Gnc,
     "switchable": Switchable,

@@ -7,7 +7,7 @@ covariance from above: what other ways know is left out.
 """
 
 from array import array
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -16,9 +16,11 @@ import numpy as np
 from ..graph import Delta, Factor, Motion, Pose, is_pose
 from ..measurement import Array
 from ..space import Space
+from .usual import Usual
 
 LEVER = 10.0  # m: how a variance of heading (rad^2) is weighed against one of position (m^2) in the price of a way
 STEPS = 24  # links that a search looks at; beyond, the best way found so far is taken
+MEMORY = 4096  # ways remembered
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -37,8 +39,8 @@ class Path:
     via: tuple[str, ...] = ()
 
     def covariance(self, scale: float, rotation: float = 1.0) -> Array:
-        """With the odometry's standard deviations multiplied by `scale`, those of its rotation by `rotation` besides."""
-        return scale**2 * (self.odometry + (rotation**2 - 1) * self.rotation) + self.loops
+        """With the odometry's covariance multiplied by `scale`, and its standard deviations of rotation by `rotation` besides."""
+        return scale * (self.odometry + (rotation**2 - 1) * self.rotation) + self.loops
 
     def then(self, other: "Path") -> "Path":
         adjoint = other.pose.inverse().AdjointMap()
@@ -95,16 +97,16 @@ class Point(NamedTuple):
 
 
 class Link(NamedTuple):
-    """`a_T_b` between points of chains: a loop, or the motion with which a chain branches off another (id empty)."""
+    """`a_T_b` between points of chains: a loop, or the motion with which a chain branches off another."""
 
-    id: str
+    factor: Factor
     a: int  # keys
     b: int
     path: Path
 
 
 class Paths:
-    """The motion factors and loops that are in the graph, as ways. `scale`: of the odometry's standard deviations."""
+    """The motion factors and loops that are in the graph, as ways. `scale`: of the odometry's covariance."""
 
     def __init__(self, space: Space, scale: float, factors: Mapping[str, Factor]) -> None:
         """factors: the solver's store, for who needs more than ways."""
@@ -119,7 +121,10 @@ class Paths:
         self._rows: list[Link | None] = []  # None: removed
         self._sides = Sides()
         self.ended = False  # the input: what is not decided now never will be
-        self.revision = 0  # grows with every loop that enters or leaves
+        self.entered: list[Factor] = []  # loops, in order, for who follows what changes
+        self.left: list[Factor] = []
+        self.usual = Usual(space.dimension)  # how large the statistics of accepted loops are
+        self._memory: dict[tuple[int, int], Path | None] = {}  # cheapest, until a link enters or leaves
 
     def book(self, delta: Delta) -> None:
         """What has entered the graph, and what has left it."""
@@ -135,12 +140,11 @@ class Paths:
         self._read()
         return self._links.keys()
 
-    def link(self, id_: str) -> Link:
-        """A loop that is in the graph."""
+    def place(self, key: int) -> tuple[int, float]:
+        """The chain of a pose, and how many metres of motion lie between there and the chain's origin."""
         self._read()
-        found = self._rows[self._links[id_]]
-        assert found is not None
-        return found
+        point = self._points[key]
+        return point.chain, self._chains[point.chain].meters[point.row]
 
     def along(self, a: int, b: int) -> Path | None:
         """Between two keys by motion alone; None where they lie on different chains."""
@@ -156,9 +160,19 @@ class Paths:
         point = self._points.get(key)
         return None if point is None else (point.chain, self._chains[point.chain].stretch(0, point.row))
 
-    def cheapest(self, a: int, b: int, without: Collection[str] = ()) -> Path | None:
+    def cheapest(self, ends: Sequence[int], without: Collection[str] = ()) -> Path | None:
         """Between two keys by motion and loops; None where nothing connects them. without: ids of loops not to be used."""
         self._read()
+        a, b = ends
+        if without:
+            return self._found(a, b, without)
+        if (a, b) not in self._memory:
+            if len(self._memory) >= MEMORY:
+                self._memory.clear()
+            self._memory[a, b] = self._found(a, b, ())
+        return self._memory[a, b]
+
+    def _found(self, a: int, b: int, without: Collection[str]) -> Path | None:
         p, q = self._points.get(a), self._points.get(b)
         if p is None or q is None:
             return None
@@ -195,7 +209,8 @@ class Paths:
             if factor.kind == "motion":
                 self._extend(factor)
             elif factor.kind == "loop" and all(map(is_pose, factor.keys)):
-                self._connect(Link(factor.id, factor.keys[0], factor.keys[1], self.path_of(factor)))
+                self.entered.append(factor)
+                self._connect(Link(factor, factor.keys[0], factor.keys[1], self.path_of(factor)))
             elif factor.kind == "gauge" and factor.keys[0] not in self._points:
                 self._begin(factor.keys[0])
 
@@ -215,10 +230,11 @@ class Paths:
         if b in self._points or point.row + 1 < len(chain.poses):  # a second motion, or a branch
             if b not in self._points:
                 self._begin(b)
+            self._memory.clear()
             meters = self.space.size(motion.pose)[0]
             covariance = motion.covariance
             path = Path(motion.pose, covariance, covariance * self._turns, self._zero, meters)
-            self._connect(Link("", a, b, path))
+            self._connect(Link(factor, a, b, path))
             return
         self._points[b] = Point(point.chain, point.row + 1)
         pose = chain.poses[-1].compose(motion.pose)
@@ -228,25 +244,26 @@ class Paths:
         turns = motion.covariance * self._turns
         chain.rotation.append(chain.rotation[-1] + adjoint @ turns @ adjoint.T)
         chain.meters.append(chain.meters[-1] + self.space.size(motion.pose)[0])
-        chain.price.append(
-            chain.price[-1] + self.scale**2 * float(self._weights @ np.diag(motion.covariance))
-        )
+        chain.price.append(chain.price[-1] + self.scale * float(self._weights @ np.diag(motion.covariance)))
 
     def _connect(self, link: Link) -> None:
         p, q = self._points[link.a], self._points[link.b]
-        if link.id:
-            self._links[link.id] = len(self._rows)
+        if link.factor.kind == "loop":
+            self._links[link.factor.id] = len(self._rows)
         self._rows.append(link)
         price = float(self._weights @ np.diag(link.path.covariance(self.scale)))
         self._sides.add(*self._priced(p), *self._priced(q), price)
-        self.revision += 1
+        self._memory.clear()
 
     def _forget(self, id_: str) -> None:
         row = self._links.pop(id_, None)
         if row is not None:
+            link = self._rows[row]
+            assert link is not None
+            self.left.append(link.factor)
             self._rows[row] = None
             self._sides.remove(row)
-            self.revision += 1
+            self._memory.clear()
 
 
 class Sides:
