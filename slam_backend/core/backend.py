@@ -51,7 +51,6 @@ SOURCES = {  # of a configuration that names none: one of each kind, by the name
     "landmark": LandmarkSource(),
     "pose": PoseSource(),
 }
-ROUNDS = 4  # of reviews after one keyframe, as long as they change something
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -410,19 +409,12 @@ class Backend:
     def _judge(self, proposed: Delta) -> None:
         self._editor.offered(proposed.add)
         self._admit(proposed, self._robust)
-        for _ in range(ROUNDS):
-            changed = [self._review(stage) for stage in self._robust]
-            if not any(changed):
-                break
-
-    def _review(self, stage: Robust) -> bool:
-        """Whether it changed anything. What it adds is judged by the others."""
-        amendment, decisions = stage.review(self.estimate)
-        added = {factor.id for factor in amendment.add}
-        self._decisions += [each for each in decisions if each.id not in added]
-        others = [other for other in self._robust if other is not stage]
-        self._admit(amendment, others, {each.id: each for each in decisions if each.id in added})
-        return bool(amendment)
+        for stage in self._robust:
+            amendment, decisions = stage.review(self.estimate)
+            added = {factor.id for factor in amendment.add}
+            self._decisions += [each for each in decisions if each.id not in added]
+            others = [other for other in self._robust if other is not stage]
+            self._admit(amendment, others, {each.id: each for each in decisions if each.id in added})
 
     def _admit(
         self, proposed: Delta, stages: Sequence[Robust], reviewed: Mapping[str, Decision] | None = None

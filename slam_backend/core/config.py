@@ -127,7 +127,7 @@ class Witness(Section):
         2, ge=1, le=20, description="loops that must agree with a far one, and with each other"
     )
     near: float = Field(
-        3.0,
+        5.0,
         ge=0,
         le=1e6,
         description="m: a loop needs no witness where odometry and accepted loops already say to within this where it ends",

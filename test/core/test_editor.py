@@ -23,7 +23,7 @@ WRONG = "relative/60.000000000/0"
 
 
 def driven(items, **given):
-    backend = Backend(**given)
+    backend = Backend(**{"robust": (), **given})  # nobody judges but the person
     for item in items:
         backend.add(item)
     return backend

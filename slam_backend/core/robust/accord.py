@@ -13,6 +13,7 @@ from .paths import Path
 from .usual import Usual
 
 LARGEST = 1000.0  # factor of a noise beyond which nothing is said about it
+WANDER = 100.0  # m over which a heading may wander as far again
 PRECISION = 1e-6  # relative, of such a factor
 
 
@@ -85,15 +86,15 @@ class Ruler:
         except np.linalg.LinAlgError:
             statistic = np.nan
         if not np.isfinite(statistic):  # numbers near the end of the scale say nothing
-            return Accord(np.inf, threshold, (np.inf, np.inf), (reach, 2 * drift), reach)
+            return Accord(np.inf, threshold, (np.inf, np.inf), (reach, 0.0), reach)
         return Accord(
             statistic,
             threshold,
             (float(np.linalg.norm(residual[self._moves])), float(np.linalg.norm(residual[self._turns]))),
-            # a heading that is off by twice the drift all the way moves the end by more than the drift
+            # a heading that is off by twice the drift all the way moves the end by more than the drift; it wanders on
             (
                 reach + _width(loops, self._moves, self.widest),
-                2 * drift + _width(loops, self._turns, self.widest),
+                2 * drift * (1 + path.meters / WANDER) + _width(loops, self._turns, self.widest),
             ),
             min(reach, _width(odometry, self._moves, threshold)),
         )
@@ -118,7 +119,7 @@ class Ruler:
         drift = self._config.drift
         over = [
             (away - bound) / share
-            for away, bound, share in zip(now.away, now.bound, (meters, 2.0), strict=True)
+            for away, bound, share in zip(now.away, now.bound, (meters, 2 + 2 * meters / WANDER), strict=True)
             if share > 0
         ]
         return (drift + max(0.0, *over)) * (1 + PRECISION)

@@ -19,7 +19,7 @@ from ..space import Space
 from .usual import Usual
 
 LEVER = 10.0  # m: how a variance of heading (rad^2) is weighed against one of position (m^2) in the price of a way
-STEPS = 24  # links that a search looks at; beyond, the best way found so far is taken
+STEPS = 32  # links from which a search goes on; beyond, the best way found so far is taken
 MEMORY = 4096  # ways remembered
 
 
@@ -293,29 +293,34 @@ class Sides:
         self, chain_a: int, price_a: float, chain_b: int, price_b: float, closed: Collection[int] = ()
     ) -> list[int]:
         """The sides through which the cheapest way from a to b enters links, in order; none: on foot, or not at all."""
-        best = abs(price_a - price_b) if chain_a == chain_b else np.inf
+        on_foot = abs(price_a - price_b) if chain_a == chain_b else np.inf
         n = self._count
-        chain, price, own = self._chain[:n], self._price[:n], self._own[:n]
-        # what it costs to have crossed the link that begins at this side
-        crossed = np.where(chain == chain_a, np.abs(price - price_a) + own, np.inf)
-        crossed[[2 * link + end for link in closed for end in (0, 1)]] = np.inf
+        if not n:
+            return []
+        chain, price, own = self._chain[:n], self._price[:n], self._own[:n].copy()
+        own[[2 * link + end for link in closed for end in (0, 1)]] = np.inf
+        out = np.arange(n) ^ 1
+        # what it costs to have crossed the link that begins at a side, and to go on to b from its other side
+        crossed = np.where(chain == chain_a, np.abs(price - price_a), np.inf) + own
+        to_b = np.where(chain[out] == chain_b, np.abs(price[out] - price_b), np.inf)
+        whole = crossed + to_b  # of the best way that ends with this link
         before = np.full(n, -1)
-        last, left = -1, crossed.copy()
-        shut = ~np.isfinite(own)
-        shut[[2 * link + end for link in closed for end in (0, 1)]] = True
+        left = crossed.copy()
         for _ in range(min(STEPS, n)):
             side = int(left.argmin())
             so_far = left[side]
-            if not so_far < best:
+            if not so_far < min(on_foot, whole.min()):
                 break
             left[side] = np.inf
-            out = side ^ 1
-            if chain[out] == chain_b and so_far + abs(price[out] - price_b) < best:
-                best, last = so_far + abs(price[out] - price_b), side
-            onward = so_far + np.abs(price - price[out]) + own
-            better = (chain == chain[out]) & (onward < crossed) & ~shut
+            here = price[side ^ 1]
+            onward = np.where(chain == chain[side ^ 1], so_far + np.abs(price - here), np.inf) + own
+            better = np.flatnonzero(onward < crossed)
             crossed[better] = left[better] = onward[better]
+            whole[better] = onward[better] + to_b[better]
             before[better] = side
+        last = int(whole.argmin())
+        if not whole[last] < on_foot:
+            return []
         sides: list[int] = []
         while last >= 0:
             sides.append(last)

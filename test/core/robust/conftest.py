@@ -66,7 +66,13 @@ class Drive:
 
     def run(self, loops: list[RelativePose], **settings: object) -> Ended:
         edges = sorted([*self.motion, *loops], key=lambda e: (e.stamp, abs(e.stamp_i - e.stamp_j) > SECOND))
-        config = {"space": self.space.name, "sources": ["edges"], "edges": {"kind": "relative"}, **settings}
+        config = {
+            "space": self.space.name,
+            "sources": ["edges"],
+            "edges": {"kind": "relative"},
+            "gate": {"odometry_scale": 3.0},  # the noise is as stated
+            **settings,
+        }
         backend = Backend(config_from(config))
         updates = [update for edge in edges for update in backend.add(edge)] + backend.finish()
         return Ended(backend, [d for update in updates for d in update.decisions])
