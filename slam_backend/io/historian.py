@@ -103,9 +103,8 @@ class Historian:
 
 
 def serve(pipe: Connection, journal: Path, config: Config) -> None:
-    """The process; ends when the node is gone."""
-    for wish in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(wish, signal.SIG_IGN)  # Ctrl-C is the node's affair
+    """The process; ends when the node is gone, or by SIGTERM: it holds nothing that could be lost."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the node's affair
     signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT, signal.SIGTERM})
 
     def begin() -> Run:
