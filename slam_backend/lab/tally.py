@@ -14,11 +14,12 @@ IN = frozenset({"accepted", "restored"})
 
 @dataclass(slots=True)
 class Loop:
-    """ends: its two stamps (ns). first, entered: how many keyframes there were when it was decided about first, and when it entered first."""
+    """ends: its two stamps (ns). rule: stage and reason of its last verdict. first, entered: how many keyframes there were when it was decided about first, and when it entered first."""
 
     ends: tuple[int, int]
     label: Label
     first: int
+    rule: str = ""
     entered: int | None = None
     kept: bool = False
 
@@ -47,6 +48,7 @@ class Tally:
         if enters and loop.entered is None:
             loop.entered = keyframes
         loop.kept = enters
+        loop.rule = f"{decision.stage}/{decision.reason}"
 
     @property
     def true(self) -> int:

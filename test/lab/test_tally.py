@@ -21,6 +21,7 @@ def test_what_counts_is_the_last_verdict():
     tally = tallied([(0, "accepted"), (2, "accepted")], [(2, "removed"), (1, "probation")], [(1, "accepted")])
     assert (tally.true, tally.true_kept, tally.wrong_kept) == (2, 2, 0)
     assert (tally.precision, tally.recall) == (1.0, 1.0)
+    assert tally.loops["loops/1"].rule == "test/because"
 
 
 def test_a_wrong_loop_that_was_kept_for_a_moment_is_not_forgotten():
