@@ -25,6 +25,7 @@ class Opinion(NamedTuple):
     threshold: float
 
 
+IN: frozenset[Verdict] = frozenset({"accepted", "restored"})
 Judgment = Generator[None, None, Mapping[str, Opinion]]  # a step at each `next`; opinions by id
 Judge = Callable[
     [Sequence[Factor], Sequence[Factor], gtsam.Values], Judgment
@@ -79,9 +80,16 @@ class Aside:
         """From odometry, not from the estimate: that is bent by the verdicts so far, and would repeat them."""
         from ..solvers.initialize import initialize
 
-        others = [factor for id_, factor in self._paths.factors.items() if id_ not in self._loops]
+        self._disown()
+        held = self._paths.factors
+        others = [factor for id_, factor in held.items() if id_ not in self._loops]
         loops = tuple(self._loops.values())
         return self._judge(others, loops, initialize([*others, *loops], estimate.values(), "odometry").values)
+
+    def _disown(self) -> None:
+        """What was let in and is gone was taken out by a person or the solver."""
+        held, told = self._paths.factors, self._told
+        self._loops = {id_: f for id_, f in self._loops.items() if id_ in held or told[id_] not in IN}
 
     @staticmethod
     def _advanced(work: Work, to_the_end: bool) -> Mapping[str, Opinion] | None:
@@ -102,7 +110,10 @@ class Aside:
         add: list[Factor] = []
         remove: list[str] = []
         decisions: list[Decision] = []
+        self._disown()
         for id_, opinion in opinions.items():
+            if id_ not in self._loops:
+                continue
             loop, held = self._loops[id_], id_ in self._paths.factors
             if opinion.keep and not held:
                 add.append(loop)

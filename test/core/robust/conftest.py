@@ -64,8 +64,7 @@ class Drive:
             for i, j in pairs
         ]
 
-    def run(self, loops: list[RelativePose], **settings: object) -> Ended:
-        edges = sorted([*self.motion, *loops], key=lambda e: (e.stamp, abs(e.stamp_i - e.stamp_j) > SECOND))
+    def backend(self, **settings: object) -> Backend:
         config = {
             "space": self.space.name,
             "sources": ["edges"],
@@ -73,7 +72,11 @@ class Drive:
             "gate": {"odometry_scale": 3.0},  # the noise is as stated
             **settings,
         }
-        backend = Backend(config_from(config))
+        return Backend(config_from(config))
+
+    def run(self, loops: list[RelativePose], **settings: object) -> Ended:
+        edges = sorted([*self.motion, *loops], key=lambda e: (e.stamp, abs(e.stamp_i - e.stamp_j) > SECOND))
+        backend = self.backend(**settings)
         updates = [update for edge in edges for update in backend.add(edge)] + backend.finish()
         return Ended(backend, [d for update in updates for d in update.decisions])
 

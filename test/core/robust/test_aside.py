@@ -3,6 +3,7 @@
 import pytest
 
 from slam_backend.core.fingerprint import run_hash
+from slam_backend.core.graph import Delta
 
 from .conftest import ends
 
@@ -40,13 +41,24 @@ def test_a_verdict_lands_a_fixed_number_of_keyframes_after_its_beginning(drive, 
     assert ended.kept == ends(true)
 
 
+@pytest.mark.parametrize("stage", STAGES)
+def test_what_a_person_takes_out_stays_out(drive, stage):
+    """Though the next judgment would let it in again."""
+    true = drive.true(2, 8)
+    backend = drive.backend(**stages(stage, every=5, lag=2))
+    for edge in sorted([*drive.motion, *true], key=lambda e: (e.stamp, abs(e.stamp_i - e.stamp_j))):
+        backend.add(edge)
+        if edge is true[5]:
+            (gone,) = [f.id for f in backend.solver.factors.values() if f.stamps == true[1].ends]
+            backend._applier.apply(Delta(remove=(gone,)))
+    backend.finish()
+    assert gone not in backend.solver.factors
+    assert len([f for f in backend.solver.factors.values() if f.kind == "loop"]) == len(true) - 1
+
+
 def _entry(drive, edges, settings):
     """The number of keyframes when the first loop entered."""
-    from slam_backend.core.backend import Backend
-    from slam_backend.core.config import config_from
-
-    config = {"space": drive.space.name, "sources": ["edges"], "edges": {"kind": "relative"}, **settings}
-    backend = Backend(config_from(config))
+    backend = drive.backend(**settings)
     for edge in sorted(edges, key=lambda e: (e.stamp, abs(e.stamp_i - e.stamp_j))):
         for update in backend.add(edge):
             if any(d.ends and d.verdict == "accepted" for d in update.decisions):
