@@ -50,7 +50,9 @@ class Track:
     def __init__(self, space: Space, noise: OdometrySource) -> None:
         self._space, self.noise = space, noise
         self._stamps = array("q")
-        self._numbers: list[tuple[float, ...]] = []
+        self._columns: tuple[
+            array[float], ...
+        ] = ()  # of Space.numbers, one row per sample: a tuple takes five times the room
         self._covariances: list[Array] = []  # per sample; only for noise `twist` (of the step) and `pose`
         self._protected = 0  # index of the newest sample that may not be thinned away
         self._strands: dict[
@@ -69,7 +71,10 @@ class Track:
             covariance = self._filled(covariance, self._sample(at - 1).between(pose))
         self._protected += at <= self._protected < len(self._stamps)
         self._stamps.insert(at, stamp)
-        self._numbers.insert(at, self._space.numbers(pose))
+        numbers = self._space.numbers(pose)
+        self._columns = self._columns or tuple(array("d") for _ in numbers)
+        for column, number in zip(self._columns, numbers, strict=True):
+            column.insert(at, number)
         if covariance is not None:
             self._covariances.insert(at, covariance)
         if len(self._stamps) - self._protected > 2 * SAMPLES_PER_STEP:
@@ -91,12 +96,12 @@ class Track:
     def samples(self) -> Samples:
         stamps = np.array(self._stamps, dtype=np.int64)
         strands = np.array([self._strands.get(stamp, -1) for stamp in stamps.tolist()], dtype=np.int64)
-        return Samples(stamps, np.array(self._numbers), np.array(self._covariances), strands)
+        return Samples(stamps, self._rows(), np.array(self._covariances), strands)
 
     def restore(self, samples: Samples) -> "Track":
         """Take over the samples of a track that is finished."""
         self._stamps = array("q", samples.stamps.tolist())
-        self._numbers = [tuple(row) for row in samples.numbers.tolist()]
+        self._columns = tuple(array("d", column) for column in samples.numbers.T.tolist())
         self._covariances = list(samples.covariances)
         strands = zip(samples.stamps.tolist(), samples.strands.tolist(), strict=True)
         self._strands = {stamp: strand for stamp, strand in strands if strand >= 0}
@@ -121,7 +126,7 @@ class Track:
         if not self._stamps:
             return Trajectory(np.zeros(0, dtype=np.int64), np.zeros((0, 7)))
         stamps, rows = np.unique(np.array(self._stamps, dtype=np.int64), return_index=True)
-        return Trajectory(stamps, self._space.sevens_of(np.array(self._numbers)[rows]))
+        return Trajectory(stamps, self._space.sevens_of(self._rows()[rows]))
 
     def pose(self, stamp: int) -> Pose:
         """`odom_T_base` at a stamp that the track covers."""
@@ -143,7 +148,10 @@ class Track:
         return Motion(pose, self._covariance(start, end, pose, last))
 
     def _sample(self, index: int) -> Pose:
-        return self._space.pose_of_numbers(self._numbers[index])
+        return self._space.pose_of_numbers([column[index] for column in self._columns])
+
+    def _rows(self) -> Array:
+        return np.ascontiguousarray(np.array(self._columns).T)
 
     def _covariance(self, start: int, end: int, motion: Pose, last: Pose) -> Array:
         if self.noise.noise == "twist" and self._covariances:
@@ -203,7 +211,9 @@ class Track:
                     self._covariances[i + 1] + adjoint @ self._covariances[i] @ adjoint.T
                 )
         where = slice(drop.start, drop.stop, 2)
-        del self._stamps[where], self._numbers[where]
+        del self._stamps[where]
+        for column in self._columns:
+            del column[where]
         if self._covariances:
             del self._covariances[where]
 
