@@ -1,6 +1,7 @@
-"""Run the benchmarks and write docs/benchmarks.md; with names, run only those and print."""
+"""Run the benchmarks and write docs/benchmarks.md; with names, run only those and renew their sections."""
 
 import platform
+import re
 import sys
 from importlib import import_module
 from pathlib import Path
@@ -17,6 +18,7 @@ BENCHES = (
     "filter",
     "solve",
     "query",
+    "report",
     "robust",
     "live",
     "journal",
@@ -34,21 +36,34 @@ Versions: {versions}.
 
 
 def main(names: list[str]) -> int:
-    sections = []
+    known = [import_module(f"bench.{name}") for name in BENCHES]
     holds = True
-    for name in names or BENCHES:
-        bench = import_module(f"bench.{name}")
+    for bench in [import_module(f"bench.{name}") for name in names] or known:
         rows = bench.rows()
         holds = holds and all(row.holds for row in rows)
         section = markdown(bench.TITLE, bench.EXPLANATION, rows)
         print(section, flush=True)
-        sections.append(section)
-    if not names:
-        found = versions()
-        machine = f"a {found.pop('machine')} machine ({found.pop('cpu')}; {platform.system()})"
-        head = HEAD.format(machine=machine, versions=", ".join(f"{k} {v}" for k, v in found.items()))
-        PAGE.write_text("\n".join([head, *sections]), encoding="utf-8")
+        write(
+            {**written(), bench.TITLE: section}, [each.TITLE for each in known]
+        )  # what is measured stays, whatever ends the next one
     return 0 if holds else 1
+
+
+def written() -> dict[str, str]:
+    """The sections of the page, by title."""
+    text = PAGE.read_text(encoding="utf-8") if PAGE.exists() else ""
+    parts = re.split(r"^(?=## )", text, flags=re.MULTILINE)[1:]
+    return {part.partition("\n")[0].removeprefix("## "): part.rstrip() + "\n" for part in parts}
+
+
+def write(sections: dict[str, str], titles: list[str]) -> None:
+    """The page anew, in the order of the table."""
+    found = versions()
+    machine = f"a {found.pop('machine')} machine ({found.pop('cpu')}; {platform.system()})"
+    head = HEAD.format(machine=machine, versions=", ".join(f"{k} {v}" for k, v in found.items()))
+    PAGE.write_text(
+        "\n".join([head, *(sections[title] for title in titles if title in sections)]), encoding="utf-8"
+    )
 
 
 if __name__ == "__main__":

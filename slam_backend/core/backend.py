@@ -38,6 +38,7 @@ from .robust import ROBUST, Robust
 from .robust.paths import Paths
 from .sensors import SENSORS
 from .sensors.odometry import OdometryPose
+from .sensors.relative import RelativePose
 from .sessions import SavedMap, Tracks, fits, joined
 from .settle import FAR
 from .solvers import SOLVERS, Solver
@@ -145,6 +146,8 @@ class Backend:
             return self._carry_out(measurement)
         if isinstance(measurement, OdometryPose) and measurement.source == self._driver:
             return self._drive(measurement)
+        if self._relative and isinstance(measurement, RelativePose) and measurement.source == self._driver:
+            self._mounts.name_base(measurement.frame_j)
         updates = self.complete(measurement.stamp)
         self._decisions += self._waiting.offer(measurement)
         self._is_complete = False

@@ -310,9 +310,7 @@ class Config(Section):
     """The whole configuration; `Config()` works for one odometry topic and standard loop closures."""
 
     space: Literal["2d", "3d"] = Field("3d", description="2d: x, y and yaw are estimated; 3d: all six")
-    base_frame: str = Field(
-        "", description="name of the robot's frame; empty: the child frame of the odometry"
-    )
+    base_frame: str = Field("", description="name of the robot's frame; empty: that of the driving source")
     keyframes: Keyframes = Keyframes()
     settle: Settle = Settle()
     isam2: Isam2 = Isam2()

@@ -22,8 +22,8 @@ class Mounts:
         self._found: dict[str, Pose] = {}
 
     def name_base(self, frame: str) -> None:
-        """The odometry's child frame, unless the configuration names another."""
-        if not self._base and frame:
+        """The frame that the driving source tells the pose of, unless the configuration names another."""
+        if not self._base and frame not in ("", "base"):
             self._base = frame.lstrip("/")
             self._found.clear()
 

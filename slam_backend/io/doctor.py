@@ -145,6 +145,8 @@ class _Watch:
             elif isinstance(item, OdometryPose) and item.source == self.driver:
                 mounts.name_base(item.child)
             else:
+                if isinstance(item, RelativePose) and item.source == self.driver:
+                    mounts.name_base(item.frame_j)
                 self._frames[item.source].update(_frames_of(item))
         for source, frames in self._frames.items():
             for frame, count in frames.items():

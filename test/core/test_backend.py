@@ -1,5 +1,6 @@
 """The back-end from measurements to poses: where each measurement lands, what fails, and that it goes on."""
 
+from dataclasses import replace
 from itertools import pairwise
 
 import gtsam
@@ -377,6 +378,15 @@ def test_edges_that_arrive_far_from_home_first_make_the_same_trajectory():
     backend.finish()
     snapshot = backend.snapshot()
     np.testing.assert_allclose(snapshot.odometry.poses, snapshot.poses, atol=1e-9)
+
+
+def test_the_frame_of_the_edges_is_the_base_whatever_its_name():
+    backend = Backend(config(driver="relative"))
+    for t in range(1, 4):
+        edge = between(t, t + 1, relation(t, t + 1), "wheels")
+        backend.add(replace(edge, frame_i="base_link", frame_j="base_link"))
+    assert not [d for update in backend.finish() for d in update.decisions]
+    assert len(backend.snapshot().stamps) == 4
 
 
 def test_a_sighting_newer_than_the_newest_edge_waits_for_the_keyframe_that_covers_it():
