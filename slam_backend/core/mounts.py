@@ -23,7 +23,7 @@ class Mounts:
 
     def name_base(self, frame: str) -> None:
         """The frame that the driving source tells the pose of, unless the configuration names another."""
-        if not self._base and frame not in ("", "base"):
+        if not self._base and frame:
             self._base = frame.lstrip("/")
             self._found.clear()
 
