@@ -7,10 +7,11 @@ rules; between the two stages `settle` judges the clock.
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import replace
+from math import inf
 from typing import Any
 
 from .config import Config
-from .firewall.continuity import Continuity
+from .firewall.continuity import Continuity, Pace
 from .firewall.covariances import (
     CAPPED,
     NOTHING,
@@ -63,13 +64,21 @@ def rechecked(items: Stream, config: Config) -> Iterator[Measurement | Decision]
     tracks: dict[str, Continuity] = {}
     for item in items:
         if isinstance(item, OdometryPose):
-            source: Any = config.sources[item.source]
-            track = tracks.setdefault(item.source, Continuity(source.max_speed, SPACES[config.space]))
+            track = tracks.get(item.source)
+            if track is None:
+                pace = pace_of(item.source, config)
+                track = tracks[item.source] = Continuity(pace, SPACES[config.space])
             yield from track.judge(item)
         else:
             yield item
     for track in tracks.values():
         yield from track.drop_doubt()
+
+
+def pace_of(name: str, config: Config) -> Pace:
+    """What bounds the motion between two messages of a source; nothing, unless it is odometry."""
+    source = config.sources.get(name)
+    return Pace(getattr(source, "max_speed", inf), SPACES[config.space])
 
 
 def _odometry(item: OdometryPose, space: Space, source: Any) -> Notes:

@@ -13,6 +13,7 @@ from heapq import heapify, heappop, heappush
 
 from .command import Command
 from .firewall.clock import Clock
+from .firewall.continuity import UNBOUND, Pace
 from .firewall.rules import MOST_WAITING, decided
 from .graph import Decision
 from .measurement import SECOND, Measurement, StaticTransform
@@ -27,14 +28,15 @@ def settled(
     last_resort: bool = True,
     ahead: int = FAR,
     passed: Callable[[int], object] = lambda _: None,
+    pace: Pace = UNBOUND,
 ) -> Iterator[Measurement | Decision]:
     """Reorder measurements; decisions, and what has no moment of its own, pass through at once.
 
     driver: the source whose stamps move the watermark. last_resort: release what waits when the input ends.
     lag: ns. ahead: ns that other sources' stamps may be beyond its newest.
-    passed: told the watermark each time it has moved, when all that is older has been taken.
+    passed: told the watermark each time it has moved, when all that is older has been taken. pace: of the driving source.
     """
-    clock, queue = Clock(lag), _Queue(driver, lag, ahead, passed)
+    clock, queue = Clock(lag, pace), _Queue(driver, lag, ahead, passed)
     for item in items:
         if isinstance(item, Decision | StaticTransform | Command):
             yield item

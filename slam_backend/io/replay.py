@@ -14,7 +14,7 @@ import gtsam
 import numpy as np
 
 from ..core.backend import Backend, Update
-from ..core.check import checked, rechecked
+from ..core.check import checked, pace_of, rechecked
 from ..core.command import LOAD, Command
 from ..core.config import Config, config_from, config_hash, config_to
 from ..core.decisions import DecisionLog
@@ -89,7 +89,8 @@ def settled_stream(
     driver = config.driver
     assert driver is not None
     lag, ahead = (round(seconds * SECOND) for seconds in (config.settle.lag, config.settle.ahead))
-    return rechecked(settled(checked(items, config), driver, lag, last_resort, ahead, passed), config)
+    pace = pace_of(driver, config)
+    return rechecked(settled(checked(items, config), driver, lag, last_resort, ahead, passed, pace), config)
 
 
 class Run:

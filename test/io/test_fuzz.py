@@ -34,8 +34,10 @@ from slam_backend.io.typestore import typestore_of
 STORE = typestore_of(())
 Rng = np.random.Generator
 NOISE = np.diag([0.01, 0.01, 0.02, 0.001, 0.001, 0.002])
-STEP = SECOND // 5
+BEGIN, STEP = 1000 * SECOND, SECOND // 5
 KEYFRAMES = 40
+AFAR = 1_000_000
+MOST = 0.8
 
 
 class Input(NamedTuple):
@@ -47,10 +49,10 @@ class Input(NamedTuple):
 
 
 def pose(n: int) -> tuple[float, ...]:
-    """A circle with a little height, half a metre a step."""
+    """A circle with a little height, half a metre a step; from AFAR on another one, a kilometre away."""
     angle = n / 20
     return (
-        10 * np.cos(angle),
+        10 * np.cos(angle) + 1000 * (n >= AFAR),
         10 * np.sin(angle),
         0.1 * np.sin(n),
         0.0,
@@ -221,36 +223,37 @@ def spoilt(data: bytes, rng: Rng) -> bytes:
 # -- worlds --------------------------------------------------------------------------------------------------------
 
 
-def world(
-    driver: str, space: str, noise: str, seed: int, bad: int, *, all_: bool = True
-) -> tuple[Config, list[Record]]:
-    """A sound drive with one observation of each kind a step, and `bad` spoilt messages of all sources among them; not
-    `all_`: of all but the driving one.
+def world(driver: str, space: str, noise: str, seed: int, bad: int) -> tuple[Config, list[Record]]:
+    """A sound drive with one observation of each kind every fourth step, which comes one step after its moment; and `bad` spoilt
+    messages of all sources among them; now and then the driving odometry is wrong about where the robot is, and about when.
     """
     rng = np.random.default_rng(seed)
     names = [driver, *(name for name in OBSERVING if name != driver)]
     sources = {name: {"kind": INPUTS[name].kind, "topic": name} for name in names if name != "/tf_static"}
-    sources[driver] |= {"noise": noise} if INPUTS[driver].kind == "odometry" else {}
+    sources[driver] |= {"noise": noise, "max_speed": 5.0} if INPUTS[driver].kind == "odometry" else {}
     config = config_from(
         {"space": space, "keyframes": {"distance": 0.4}, "sources": list(sources), **sources}
     )
     records: list[Record] = []
     share = bad / KEYFRAMES
     for n in range(KEYFRAMES):
-        stamp = 1000 * SECOND + n * STEP
+        stamp = BEGIN + n * STEP
         own = 2 * n if driver == "loops" else n  # an even one spans a single step
         records.append(Record(driver, INPUTS[driver].type, stamp, INPUTS[driver].make(own, stamp)))
         records += [
-            Record(name, INPUTS[name].type, stamp, INPUTS[name].make(n, stamp))
+            Record(name, INPUTS[name].type, stamp, INPUTS[name].make(n - 1, stamp - STEP))
             for name in names[1:]
-            if n % 4 == 1
+            if n % 4 == 2
         ]
         for _ in range(int(share) + (rng.random() < share % 1)):
-            name = names[int(rng.integers(0 if all_ else 1, len(names)))]
+            name = names[int(rng.integers(0, len(names)))]
             data = spoilt(
                 INPUTS[name].make(int(rng.integers(0, 100)), stamp + int(rng.integers(0, STEP))), rng
             )
             records.append(Record(name, INPUTS[name].type, stamp, data))
+        if n % 4 == 3 and INPUTS[driver].kind == "odometry":
+            data = INPUTS[driver].make(AFAR + n, stamp + int(rng.integers(STEP, SECOND)))
+            records.append(Record(driver, INPUTS[driver].type, stamp, data))
     return config, records
 
 
@@ -289,12 +292,14 @@ WORLDS = list(worlds())
 
 
 def prove(driver: str, space: str, noise: str, seed: int, bad: int) -> int:
-    """Factors and estimate are those of the same input without what was refused. Returns the number refused.
+    """Factors and estimate are those of the same input without what was refused; they are finite, and most of the sound
+    keyframes are there. Returns the number refused.
 
-    Of all sources but the driving one: a message of that one which only its neighbours give away has moved the watermark.
+    It holds while what the driving source says wrong is refused or believed for good when it comes. A message that fits what was
+    known then, and is contradicted later by one of between, has moved the watermark.
     """
-    config, records = world(driver, space, noise, seed, bad, all_=False)
-    backend, _, kept = solved(config, records)
+    config, records = world(driver, space, noise, seed, bad)
+    backend, log, kept = solved(config, records)
     sound = {
         n
         for n, item in decoded(records)
@@ -305,16 +310,11 @@ def prove(driver: str, space: str, noise: str, seed: int, bad: int) -> int:
     np.testing.assert_array_equal(first.stamps, second.stamps)
     assert list(backend.solver.factors) == list(again.solver.factors)
     np.testing.assert_allclose(first.trajectory.sevens, second.trajectory.sevens, atol=1e-6, rtol=1e-6)
-    return len(records) - len(sound)
-
-
-def survive(driver: str, space: str, noise: str, seed: int, bad: int) -> None:
-    """With the driving source spoilt as well: nothing raises, and what comes out is finite and told."""
-    config, records = world(driver, space, noise, seed, bad)
-    backend, log, _ = solved(config, records)
-    assert np.isfinite(backend.snapshot().trajectory.sevens).all()
+    assert np.isfinite(first.trajectory.sevens).all()
+    assert len({BEGIN + n * STEP for n in range(KEYFRAMES)} & set(first.stamps.tolist())) > MOST * KEYFRAMES
     assert all(decision.reason for decision in log)
     assert len(log) < 10 * len(records)
+    return len(records) - len(sound)
 
 
 @pytest.mark.parametrize(("driver", "space", "noise"), WORLDS)
@@ -322,19 +322,13 @@ def test_what_is_refused_leaves_no_trace(driver: str, space: str, noise: str) ->
     assert prove(driver, space, noise, seed=1, bad=130) > 30
 
 
-@pytest.mark.parametrize(("driver", "space", "noise"), WORLDS)
-def test_nothing_raises_when_the_driving_source_is_spoilt_too(driver: str, space: str, noise: str) -> None:
-    survive(driver, space, noise, seed=1, bad=100)
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("part", range(10))
 def test_a_hundred_thousand_spoilt_messages(part: int) -> None:
     begin = process_time()
-    for seed in range(20):
+    for seed in range(40):
         driver, space, noise = WORLDS[(part + seed) % len(WORLDS)]
         prove(driver, space, noise, seed=1000 * part + seed, bad=250)
-        survive(driver, space, noise, seed=1000 * part + seed, bad=250)
     assert process_time() - begin < 1200
 
 

@@ -4,8 +4,11 @@ import numpy as np
 import pytest
 
 from slam_backend.core.firewall.clock import Clock
+from slam_backend.core.firewall.continuity import Pace
 from slam_backend.core.graph import Decision
-from slam_backend.core.measurement import SECOND, Measurement
+from slam_backend.core.measurement import SECOND, Measurement, frozen
+from slam_backend.core.sensors.odometry import STILL, UNKNOWN, OdometryPose
+from slam_backend.core.space import SPACES
 
 
 def judged(*seconds: float, lag: float = 0.2, end: bool = True) -> list[str]:
@@ -84,3 +87,53 @@ def test_nothing_is_lost_without_a_word():
             told += sum(not isinstance(i, Decision) or i.verdict == "refused" for i in out)
         told += sum(not isinstance(i, Decision) or i.verdict == "refused" for i in clock.end())
         assert told == len(stamps)
+
+
+# -- pace ----------------------------------------------------------------------------------------------------------
+
+
+def at(seconds: float, x: float, frame: str = "odom") -> OdometryPose:
+    pose = frozen((x, 0, 0, 0, 0, 0, 1))
+    return OdometryPose(round(seconds * SECOND), "wheels", frame, "base", pose, UNKNOWN, STILL, UNKNOWN)
+
+
+def paced(*items: OdometryPose) -> list[str]:
+    clock = Clock(SECOND // 5, Pace(2.0, SPACES["2d"]))
+    out = [each for item in items for each in clock.judge(item)]
+    out += clock.end()
+    return [
+        f"{i.verdict} {i.stage}/{i.reason}@{i.stamp / SECOND:g}" if isinstance(i, Decision) else f"{i.stamp / SECOND:g}"
+        for i in out
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("lure", "rule"), [(at(1.9, 500), "teleport"), (at(1.9, 0.2, "elsewhere"), "frame_changed")]
+)
+def test_one_message_from_elsewhere_does_not_carry_the_clock_ahead(lure: OdometryPose, rule: str) -> None:
+    assert paced(at(1, 0), at(1.1, 0.1), lure, at(1.2, 0.2)) == [
+        "1", "1.1", f"refused recheck/{rule}@1.9", "1.2",
+    ]  # fmt: skip
+    clock = Clock(0, Pace(2.0, SPACES["2d"]))
+    for item in (at(1, 0), at(1.1, 0.1), lure):
+        clock.judge(item)
+    assert clock.newest == at(1.1, 0).stamp
+
+
+def test_elsewhere_is_believed_when_the_next_message_comes_from_there_too() -> None:
+    assert paced(at(1, 0), at(1.1, 0), at(1.2, 500), at(1.3, 500)) == ["1", "1.1", "1.2", "1.3"]
+
+
+def test_the_same_message_again_is_no_witness_and_no_contradiction() -> None:
+    assert paced(at(1, 0), at(1.1, 0), at(1.2, 500), at(1.2, 500), at(1.3, 500)) == [
+        "1", "1.1", "refused recheck/duplicate@1.2", "1.2", "1.3",
+    ]  # fmt: skip
+
+
+def test_two_frames_on_one_topic_do_not_keep_the_clock_from_going_on_after_a_pause() -> None:
+    pairs = [at(s, 0, frame) for s in (1, 1.1, 40, 40.1, 40.2, 40.3) for frame in ("odom", "other")]
+    assert [s for s in paced(*pairs) if " " not in s and float(s) > 2][:1] == ["40"]
+
+
+def test_an_older_message_from_elsewhere_is_left_to_its_turn() -> None:
+    assert paced(at(1, 0), at(1.1, 0), at(1.05, 500), at(1.2, 0)) == ["1", "1.1", "1.05", "1.2"]
