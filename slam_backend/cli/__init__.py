@@ -33,6 +33,7 @@ VERBS: Mapping[
     "edit": "Loops and other factors of a finished run disabled, forced, reweighted; undone.",
     "report": "A page that answers what people ask of a run.",
     "doctor": "A recording as the firewall sees it: what each topic holds, and what to mend.",
+    "why": "Why a loop is in the graph or not, and what difference it makes.",
     "query": "Poses at any stamp, covariances, landmarks, decisions of a finished run.",
     "evaluate": "How far a run is from the truth: ATE, RPE.",
     "diff": "What moved in the map between two moments, and what came between them.",

@@ -105,6 +105,7 @@ class Backend:
         self._is_complete = False  # nothing was offered since the last keyframes along edges were made
         self._growth = Growth(space, self.timeline, self.track, self.parts)
         self._decisions: list[Decision] = []  # told with the next update
+        self._undecided: dict[str, Decision] = {}  # what a stage thinks over: what those before it found
         self._newest: tuple[Keyframe, Pose] | None = None  # and its odometry pose
         book = paths.book if self._robust else lambda _: None
         self._applier = Applier(self.solver, space, self.parts, self._waiting.wake, book)
@@ -415,9 +416,15 @@ class Backend:
         for stage in self._robust:
             amendment, decisions = stage.review(self.estimate)
             added = {factor.id for factor in amendment.add}
+            decisions = tuple(self._with_basis(each) for each in decisions)
             self._decisions += [each for each in decisions if each.id not in added]
             others = [other for other in self._robust if other is not stage]
             self._admit(amendment, others, {each.id: each for each in decisions if each.id in added})
+
+    def _with_basis(self, decision: Decision) -> Decision:
+        """With what earlier stages found, where a stage has taken its time to decide."""
+        before = self._undecided.pop(decision.id, None)
+        return replace(decision, basis={**before.basis, **decision.basis}) if before else decision
 
     def _admit(
         self, proposed: Delta, stages: Sequence[Robust], reviewed: Mapping[str, Decision] | None = None
@@ -437,6 +444,8 @@ class Backend:
                     passed[each.id] = told
                 else:
                     self._decisions.append(told)
+            decided = {each.id for each in decisions}
+            self._undecided |= {id_: each for id_, each in passed.items() if id_ not in decided | kept}
         proposed, overruled = self._editor.respected(proposed, passed)
         self._decisions += overruled
         self._applier.apply(touched(proposed), passed)

@@ -127,13 +127,13 @@ class Witness(Section):
         2, ge=1, le=20, description="loops that must agree with a far one, and with each other"
     )
     near: float = Field(
-        5.0,
+        2.0,
         ge=0,
         le=1e6,
         description="m: a loop needs no witness where odometry and accepted loops already say to within this where it ends",
     )
     reach: float = Field(
-        60.0, gt=0, le=1e6, description="m of odometry, both ends together, over which two loops are compared"
+        50.0, gt=0, le=1e6, description="m of odometry, both ends together, over which two loops are compared"
     )
     apart: float = Field(
         1.0,

@@ -54,8 +54,9 @@ class Accord:
 class Ruler:
     """Compares relative poses. Settings: those of the gate."""
 
-    def __init__(self, space: Space, config: Gate, usual: Usual) -> None:
-        self._space, self._config, self.usual = space, config, usual
+    def __init__(self, space: Space, config: Gate, usual: Usual, near: float = np.inf) -> None:
+        """near: how long odometry is believed not to drift by more than `gate.drift`: while that is below so many metres."""
+        self._space, self._config, self.usual, self._near = space, config, usual, near
         self.widest = chi2_quantile(config.probability, space.dimension)
         turns = np.diag(space.diagonal(1.0, 0.0)) > 0
         self._turns, self._moves = np.flatnonzero(turns), np.flatnonzero(~turns)
@@ -87,17 +88,14 @@ class Ruler:
             statistic = np.nan
         if not np.isfinite(statistic):  # numbers near the end of the scale say nothing
             return Accord(np.inf, threshold, (np.inf, np.inf), (reach, 0.0), reach)
-        return Accord(
-            statistic,
-            threshold,
-            (float(np.linalg.norm(residual[self._moves])), float(np.linalg.norm(residual[self._turns]))),
-            # a heading that is off by twice the drift all the way moves the end by more than the drift; it wanders on
-            (
-                reach + _width(loops, self._moves, self.widest),
-                2 * drift * (1 + path.meters / WANDER) + _width(loops, self._turns, self.widest),
-            ),
-            min(reach, _width(odometry, self._moves, threshold)),
+        sure = min(reach, _width(odometry, self._moves, threshold))
+        # a heading that is off by twice the drift all the way moves the end by more than the drift; it wanders on
+        bound = (
+            reach + _width(loops, self._moves, self.widest),
+            2 * drift * (1 + path.meters / WANDER) + _width(loops, self._turns, self.widest),
         )
+        away = float(np.linalg.norm(residual[self._moves])), float(np.linalg.norm(residual[self._turns]))
+        return Accord(statistic, threshold, away, bound if sure <= self._near else (np.inf, np.inf), sure)
 
     def remedy(self, measured: Path, path: Path) -> tuple[Noise, float]:
         """The smallest change with which `compare` would pass: factors of one noise, and the drift.

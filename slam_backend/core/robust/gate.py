@@ -30,17 +30,15 @@ class Gate:
     def __init__(self, config: Config, paths: Paths) -> None:
         self._paths, self._drift = paths, config.gate.drift
         self._others, self._room = config.witness.others, config.witness.held
-        self._ruler = Ruler(paths.space, config.gate, paths.usual)
+        self._ruler = Ruler(paths.space, config.gate, paths.usual, config.witness.near)
         self._statistics: dict[str, float] = {}  # of what was let through, until it is in the graph
-        self._refused = Held(paths, self._ruler, config.witness)
-        self._contested = Held(
-            paths, self._ruler, config.witness
-        )  # those of them that odometry does not contradict
+        self._refused = Held(paths, config)
+        self._contested = Held(paths, config)  # those of them that odometry does not contradict
         self._culprits: dict[
             str, frozenset[str]
         ] = {}  # of the contested: accepted loops without which they would pass
         self._fresh: list[Factor] = []  # contested since the last review
-        self._inside = Held(paths, self._ruler, config.witness)  # in the graph
+        self._inside = Held(paths, config)  # in the graph
         self._given_up: set[str] = set()
         self._suspects: dict[str, Factor] = {}  # in the graph, where something has changed
         self._entered = self._left = 0  # of what came into the graph, and went

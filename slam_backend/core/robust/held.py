@@ -9,7 +9,7 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from ..config import Witness
+from ..config import Config
 from ..graph import Factor
 from .accord import Accord, Ruler
 from .paths import Path, Paths
@@ -20,8 +20,9 @@ LOOKS = 24  # nearest loops that a clique is searched among
 class Held:
     """Loops by id, in the order in which they came."""
 
-    def __init__(self, paths: Paths, ruler: Ruler, config: Witness) -> None:
-        self._paths, self._ruler, self._config = paths, ruler, config
+    def __init__(self, paths: Paths, config: Config) -> None:
+        self._paths, self._config = paths, config.witness
+        self._ruler = Ruler(paths.space, config.gate, paths.usual)
         self._loops: dict[str, Factor] = {}
         self._rows: dict[str, int] = {}
         self._ids: list[str] = []

@@ -26,9 +26,9 @@ class Witness:
 
     def __init__(self, config: Config, paths: Paths) -> None:
         self._config, self._paths = config.witness, paths
-        self._ruler = Ruler(paths.space, config.gate, paths.usual)
+        self._ruler = Ruler(paths.space, config.gate, paths.usual, config.witness.near)
         self._lone = chi2_quantile(self._config.lone, paths.space.dimension) if self._config.lone else 0.0
-        self._known = Held(paths, self._ruler, self._config)  # in the graph or waiting
+        self._known = Held(paths, config)  # in the graph or waiting
         self._waiting: dict[str, float] = {}  # how far off (m) the graph may be about where they end
         self._fresh: list[Factor] = []  # not told about yet
         self._round: list[str] = []  # of what waits, whose turn comes yet; the next one last
