@@ -23,7 +23,7 @@ def runs(drive, tmp_path_factory):
     """good and its twin; bad, on purpose: the wrong loops are believed."""
     folder = tmp_path_factory.mktemp("runs")
     for name, kernel in (("good", "cauchy"), ("twin", "cauchy"), ("bad", "none")):
-        run = replay(drive.bag, load_config(drive.config), [f"loops.kernel={kernel}"])
+        run = replay(drive.bag, load_config(drive.config), ["robust=[]", f"loops.kernel={kernel}"])
         write_run(run.result, folder / name)
     return folder
 
@@ -77,7 +77,7 @@ def test_everything_is_there_as_json_and_as_a_page(runs, tmp_path, capsys):
 def test_a_filter_s_refusals_are_decisions_that_flipped(runs, drive, tmp_path, capsys):
     from slam_backend.lab.ekf import Ekf
 
-    run = replay(drive.bag, load_config(drive.config), ["loops.kernel=cauchy"], estimator=Ekf)
+    run = replay(drive.bag, load_config(drive.config), ["robust=[]", "loops.kernel=cauchy"], estimator=Ekf)
     write_run(run.result, tmp_path / "filter")
     assert main([*compare(runs, "good"), str(tmp_path / "filter"), "--json"]) == 0
     _, filter_ = json.loads(capsys.readouterr().out)

@@ -297,7 +297,7 @@ def test_public_graphs_online(name, optimum, bound, throws):
     if not path.exists():
         pytest.skip("the shared data is not here")
     graph = read_graph(path)
-    backend, failures = Backend(Config(space=graph.space, sources={"edges": RelativeSource()})), 0
+    backend, failures = Backend(Config(space=graph.space, robust=(), sources={"edges": RelativeSource()})), 0
     for measurement in measurements(graph):
         for update in backend.add(measurement):
             if any(d.stage == "solver" for d in update.decisions):
