@@ -12,7 +12,7 @@ written again. What memory cannot hold is neither applied nor kept; a record of 
 import sqlite3
 import threading
 from collections import deque
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import closing, suppress
 from itertools import islice
 from pathlib import Path
@@ -29,6 +29,9 @@ from .storage.sealed import checksum
 
 NAME = "journal.db3"
 LIMIT = 200_000  # records that wait in memory while the file cannot be written; what comes then is lost
+LIMIT_BYTES = 256 << 20  # of their data
+SHARE = 0.75  # of that for topics that are not protected: the rest is the driving source's
+TOO_LONG = "the journal could not be written for too long"
 RETRY = 1.0  # s between two attempts to write
 ROWS = (
     "SELECT m.id, t.name, t.type, m.timestamp, m.data, c.crc32 FROM messages m NOT INDEXED "
@@ -47,7 +50,7 @@ class Row(NamedTuple):
 class Journal:
     """Append from any thread; `committed` is the id of the newest row that is acknowledged: on disk, for readers to see.
 
-    heard: whether it holds anything but what it says of itself. lost: records that could not be kept, since the file could not be written for long. trouble: why it cannot be
+    heard: whether it holds anything but what it says of itself. lost: records that could not be kept, since there was no room in memory. trouble: why it cannot be
     written just now; empty: it can.
     """
 
@@ -60,8 +63,13 @@ class Journal:
         self.trouble = ""
         self._failed, self._settings = failed, settings or Journaling()
         self._queue: deque[Numbered] = deque()
+        self._bytes = 0  # of what is queued
+        self._full = False  # since the last commit something has been lost, and that was said
+        self.protected: Collection[str] = ()  # topics that others must not crowd out
         self._announced: dict[str, str] = {}
-        self._gap: tuple[int, int] | None = None  # log time of the last record before it, records lost in it
+        self._gap: tuple[int, int, str] | None = (
+            None  # log time of the last record before it, records lost in it, why
+        )
         self._arrival = threading.Lock()
         self._wake, self._stop = threading.Event(), threading.Event()
         self._grown = threading.Condition()
@@ -95,13 +103,24 @@ class Journal:
         with self._arrival:  # the order of the queue is that of the log times
             if self._stop.is_set():
                 return False
-            if len(self._queue) >= LIMIT:
-                self._lose()
-                return True
-            self._confess()
-            self._enqueue(topic, type_, data)
+            fits = self._has_room(topic, len(data))
+            news, self._full = not (fits or self._full), self._full or not fits
+            if fits:
+                self._confess()
+                self._enqueue(topic, type_, data)
+            else:
+                self._lose(1, TOO_LONG)
+        if news:
+            self._failed(f"{self.path}: memory is full: {topic} is lost; {TOO_LONG}")
         self._wake.set()
         return True
+
+    def miss(self, lost: Mapping[str, int], why: str) -> None:
+        """Records that were heard and never came here: topic -> how many. The gap is confessed before what comes next."""
+        told = ", ".join(f"{n} of {topic}" for topic, n in sorted(lost.items()))
+        with self._arrival:
+            self._lose(sum(lost.values()), f"{why}: {told}")
+        self._failed(f"{self.path}: records are lost: {why}: {told}")
 
     def note(self, event: Event) -> None:
         """Something that the journal says of itself."""
@@ -146,19 +165,24 @@ class Journal:
         self._newest = max(self._newest + 1, time_ns())
         self._appended += 1
         self.heard |= topic != events.TOPIC
+        self._bytes += len(data)
         self._queue.append((self._appended, Record(topic, type_, self._newest, data)))
 
-    def _lose(self) -> None:
-        self.lost += 1
-        after, count = self._gap or (self._newest, 0)
-        self._gap = after, count + 1
+    def _has_room(self, topic: str, size: int) -> bool:
+        """What waits may have been applied and must stay: so of a flood the newest are lost, and those of no other source."""
+        share = SHARE if self.protected and topic not in self.protected else 1.0
+        return len(self._queue) < share * LIMIT and self._bytes + size <= share * LIMIT_BYTES
+
+    def _lose(self, count: int, why: str) -> None:
+        self.lost += count
+        after, before, _ = self._gap or (self._newest, 0, "")
+        self._gap = after, before + count, why
 
     def _confess(self) -> None:
         """Before anything else comes into the queue."""
         if self._gap is not None:
-            (after, count), self._gap = self._gap, None
+            (after, count, why), self._gap = self._gap, None
             until = max(self._newest + 1, time_ns())
-            why = "the journal could not be written for too long"
             self._enqueue(events.TOPIC, events.TYPE, events.encoded(events.gap(after, until, count, why)))
 
     # -- the writer's thread -----------------------------------------------------------------------
@@ -217,7 +241,9 @@ class Journal:
                 name: type_ for name, type_ in self._announced.items() if name not in announced
             }
             for _ in batch:
-                self._queue.popleft()
+                _, record = self._queue.popleft()
+                self._bytes -= len(record.data)
+            self._full = False
         with self._grown:
             self.committed += len(batch)
             self._grown.notify_all()

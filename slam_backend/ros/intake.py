@@ -1,6 +1,5 @@
 """From what is heard to the journal: what is worth keeping, what drives, when a clock has jumped."""
 
-from collections import deque
 from collections.abc import Sequence
 from typing import Any, Protocol
 
@@ -10,14 +9,14 @@ from ..core.measurement import SECOND
 from ..core.sensors.odometry import TRANSFORMS, OdometryPose
 from ..io.cdr import Decoder
 from ..io.inputs import TF_STATIC
-from ..io.journal import LIMIT
+from ..io.journal import LIMIT, LIMIT_BYTES
 from ..io.records import Record
+from .backlog import Backlog
 from .finder import Finder
 from .session import Session
 
 JUMP = SECOND  # ns that the driving source must go back for its clock to have jumped
-DOUBTFUL = 10_000  # messages at most that are kept in case its clock has jumped
-Heard = tuple[str, str, bytes]  # topic, type, CDR
+DOUBTFUL, DOUBTFUL_BYTES = 10_000, 64 << 20  # messages at most that are kept in case its clock has jumped
 
 
 class Host(Protocol):
@@ -45,8 +44,10 @@ class Intake:
     def __init__(self, host: Host, typestore: Any, *, finding: bool) -> None:
         self._host, self._typestore = host, typestore
         self._finder = Finder(typestore) if finding else None
-        self._early: deque[Heard] = deque(maxlen=LIMIT)  # heard between two sessions
-        self._doubtful: list[Heard] = []  # since the odometry went back in time; its next message tells
+        self._early = Backlog(LIMIT, LIMIT_BYTES)  # heard between two sessions
+        self._doubtful = Backlog(
+            DOUBTFUL, DOUBTFUL_BYTES
+        )  # since the odometry went back in time; its next message tells
         self._static: dict[bytes, str] = {}  # what came on /tf_static, and its type
         self._driving = ""
         self._decoder = Decoder(typestore, {})
@@ -58,6 +59,7 @@ class Intake:
         source = config.sources[driver] if driver is not None else None
         drives = source is not None and source.kind == "odometry"
         self._driving = source.topic if source is not None and drives else ""
+        self._early.protected = self._doubtful.protected = source.topic if source is not None else ""
         self._decoder = Decoder(self._typestore, {self._driving: (str(driver), "odometry")} if drives else {})
 
     def begin(self, session: Session) -> None:
@@ -72,6 +74,11 @@ class Intake:
     def drain(self) -> None:
         """Take what waits for a session, if there is one."""
         while self._early and (session := self._host.session) is not None:
+            if self._early.dropped:
+                session.journal.miss(
+                    self._early.dropped, "more came between two sessions than memory should hold"
+                )
+                self._early.dropped.clear()
             self._take(session, *self._early.popleft())
 
     def _take(self, session: Session, topic: str, type_: str, data: bytes) -> None:
@@ -84,17 +91,17 @@ class Intake:
         if any(self._jumps.jumped_back(item.stamp) for item in odometry) and self._host.begins_anew(
             odometry[0].source
         ):
-            self._early.extendleft(reversed([*self._doubtful, (topic, type_, data)]))
-            self._doubtful = []
+            self._early.dropped += self._doubtful.dropped
+            self._early.put_back([*self._doubtful.clear(), (topic, type_, data)])
             return
-        if not self._jumps.doubts:
-            self._doubtful = []
-        elif len(self._doubtful) < DOUBTFUL:
+        if self._jumps.doubts:
             self._doubtful.append((topic, type_, data))
+        else:
+            self._doubtful.clear()
         if type_ == TRANSFORMS and topic == self._driving and not odometry:
             return  # of other frames
         if not session.journal.append(topic, type_, data):
-            self._early.appendleft((topic, type_, data))  # the session has just ended
+            self._early.put_back([(topic, type_, data)])  # the session has just ended
             return
         for item in odometry:
             self._host.moved(item)

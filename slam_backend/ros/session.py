@@ -96,6 +96,8 @@ class Session:
             if self.historian is not None:
                 self.historian.close()
             self.historian = Historian(self.journal.path, config, self._state.reached)
+            driving = [config.sources[config.driver].topic] if config.driver else []
+            self.journal.protected = (*driving, *OWN)
             self.journal.note({"event": "config", "config": config_to(config), "hash": config_hash(config)})
             self._state.expect(self.journal.committed)
             self.feeder = Feeder(self.journal, config, table, self._state.take, self._incident, held)

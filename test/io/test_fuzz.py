@@ -224,8 +224,9 @@ def spoilt(data: bytes, rng: Rng) -> bytes:
 
 
 def world(driver: str, space: str, noise: str, seed: int, bad: int) -> tuple[Config, list[Record]]:
-    """A sound drive with one observation of each kind every fourth step, which comes one step after its moment; and `bad` spoilt
-    messages of all sources among them; now and then the driving odometry is wrong about where the robot is, and about when.
+    """A sound drive, its first steps undisturbed, with one observation of each kind every fourth step, which comes one step after
+    its moment; and `bad` spoilt messages of all sources among them. Now and then the driving odometry is wrong about where the
+    robot is, and about when.
     """
     rng = np.random.default_rng(seed)
     names = [driver, *(name for name in OBSERVING if name != driver)]
@@ -245,7 +246,7 @@ def world(driver: str, space: str, noise: str, seed: int, bad: int) -> tuple[Con
             for name in names[1:]
             if n % 4 == 2
         ]
-        for _ in range(int(share) + (rng.random() < share % 1)):
+        for _ in range(int(share) + (rng.random() < share % 1) if n > 2 else 0):
             name = names[int(rng.integers(0, len(names)))]
             data = spoilt(
                 INPUTS[name].make(int(rng.integers(0, 100)), stamp + int(rng.integers(0, STEP))), rng

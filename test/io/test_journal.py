@@ -198,6 +198,53 @@ def test_memory_is_bounded_and_what_is_lost_is_counted(journal, complaints, monk
     assert "its last 50 records could not be written" in complaints[-1]
 
 
+def test_bytes_in_memory_are_bounded_too(journal, complaints, monkeypatch) -> None:
+    monkeypatch.setattr(module, "RETRY", 0.05)
+    monkeypatch.setattr(module, "LIMIT_BYTES", 5000)
+    journal._database.execute("PRAGMA max_page_count=1")
+    for _ in range(60):
+        journal.append("/odom", ODOMETRY, bytes(100))
+    until(lambda: len(complaints) == 2)
+    assert (journal.waiting, journal.lost) == (50, 10)
+    assert any("memory is full: /odom is lost" in line for line in complaints)
+    journal._database.execute("PRAGMA max_page_count=1000000")
+    until(lambda: journal.waiting == 0)
+    for _ in range(50):
+        journal.append("/odom", ODOMETRY, bytes(100))
+    assert journal.lost == 10
+
+
+def test_a_flood_does_not_crowd_out_the_driving_source(journal, complaints, monkeypatch) -> None:
+    monkeypatch.setattr(module, "RETRY", 0.05)
+    monkeypatch.setattr(module, "LIMIT", 100)
+    journal.protected = ("/odom",)
+    journal._database.execute("PRAGMA max_page_count=1")
+    for _ in range(200):
+        journal.append("/scan", "sensor_msgs/msg/PointCloud2", bytes(100))
+    for n in range(24):
+        journal.append("/odom", ODOMETRY, message(n))
+    assert (journal.waiting, journal.lost) == (100, 125)  # the gap is one of them
+    until(lambda: len(complaints) == 2)
+    journal._database.execute("PRAGMA max_page_count=1000000")
+    until(lambda: journal.waiting == 0)
+    found = [row.record for row in rows(journal.path)]
+    assert [record.data for record in found if record.topic == "/odom"] == [message(n) for n in range(24)]
+    assert [events.event_of(r.data)["lost"] for r in found if r.topic == events.TOPIC] == [125]
+
+
+def test_what_was_lost_before_it_came_here_is_confessed_as_well(journal, complaints) -> None:
+    journal.append("/odom", ODOMETRY, message(0))
+    journal.miss({"/scan": 7, "/tags": 2}, "no room")
+    journal.append("/odom", ODOMETRY, message(1))
+    journal.close()
+    found = [row.record for row in rows(journal.path)]
+    assert [record.topic for record in found] == ["/odom", events.TOPIC, "/odom"]
+    gap = events.event_of(found[1].data)
+    assert (gap["lost"], gap["why"]) == (9, "no room: 7 of /scan, 2 of /tags")
+    assert journal.lost == 9
+    assert "no room: 7 of /scan, 2 of /tags" in complaints[0]
+
+
 def test_a_gap_is_confessed_in_the_journal(journal, complaints, monkeypatch) -> None:
     """Where it lies, before all that came afterwards, and told to whoever decodes the journal."""
     monkeypatch.setattr(module, "RETRY", 0.05)

@@ -1,25 +1,29 @@
 """Between topic and journal: jumps of a clock, sources that are found while their messages come."""
 
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 pytest.importorskip("rclpy")
 
-from slam_backend.core.config import Config
+from slam_backend.core.config import Config, config_from
 from slam_backend.core.measurement import SECOND
+from slam_backend.io import events
 from slam_backend.io.encode import (
     encode_cloud,
     encode_odometry,
     encode_pose_with_covariance,
     encode_transforms,
 )
+from slam_backend.io.journal import Journal, JournalReader
 from slam_backend.io.records import Record
 from slam_backend.io.typestore import typestore_of
 from slam_backend.ros import finder as module
+from slam_backend.ros import intake as intake_module
 from slam_backend.ros.finder import Finder
-from slam_backend.ros.intake import Jumps
+from slam_backend.ros.intake import Intake, Jumps
 
 START = 1_700_000_000 * SECOND
 ZEROS = np.zeros(36), np.zeros(6), np.zeros(36)
@@ -155,3 +159,48 @@ def test_a_topic_that_is_called_like_a_setting_is_a_source_all_the_same(seen) ->
         "path_": "/path",
         "sources_": "/sources",
     }
+
+
+@dataclass
+class Node:
+    """Where an intake stands in for nobody: its session comes later."""
+
+    config: Config
+    session: object = None
+    moves: list[int] = field(default_factory=list)
+
+    def moved(self, odometry) -> None:
+        self.moves.append(odometry.stamp)
+
+
+def test_a_flood_between_two_sessions_costs_its_own_oldest_and_is_confessed(tmp_path, monkeypatch) -> None:
+    monkeypatch.setattr(intake_module, "LIMIT", 100)
+    config = config_from(
+        {
+            "sources": ["wheels", "tags"],
+            "wheels": {"kind": "odometry", "topic": "/odom"},
+            "tags": {"kind": "landmark", "topic": "/tags"},
+        }
+    )
+    node = Node(config)
+    intake = Intake(node, typestore_of(()), finding=False)
+    intake.use(config)
+    for n in range(40):
+        stamp = START + n * SECOND // 10
+        intake.receive("/odom", ODOMETRY.type, encode_odometry(stamp, "odom", "base", POSE, *ZEROS))
+        for _ in range(10):
+            intake.receive("/tags", TAGS.type, TAGS.data)
+    incidents = []
+    journal = Journal(tmp_path, incidents.append)
+    node.session = SimpleNamespace(journal=journal)
+    intake.drain()
+    journal.close()
+    reader = JournalReader(journal.path)
+    found = [row.record for row in reader.after(0, 1000)]
+    reader.close()
+    assert [record.topic for record in found].count("/odom") == len(node.moves) == 40
+    assert [record.topic for record in found].count("/tags") == 60
+    gap = events.event_of(found[0].data)
+    assert (gap["event"], gap["lost"]) == ("gap", 340)
+    assert journal.lost == 340
+    assert "340 of /tags" in incidents[0]
