@@ -372,7 +372,7 @@ class Backend:
     ) -> list[Update]:
         """Solve: motion and all that nothing judges first, then what the robust stages let in."""
         self._decisions += delta.decisions
-        self._decisions += [self._waiting.wait(each) for each in delta.waits]
+        self._decisions += [told for each in delta.waits for told in self._waiting.wait(each)]
         judged = tuple(f for f in delta.add if any(f.kind in stage.kinds for stage in self._robust))
         sure = without(delta, {factor.id for factor in judged})
         try:

@@ -1,7 +1,9 @@
 """Measurements on their way: for a keyframe that covers them, or for a variable that they need."""
 
+from array import array
+from bisect import bisect_left
 from collections import Counter, defaultdict
-from collections.abc import Callable, Collection, Iterable
+from collections.abc import Callable, Collection, Iterable, Sequence
 from heapq import heappop, heappush
 from itertools import islice
 
@@ -20,7 +22,8 @@ class Waiting:
         self._pending: list[Offer] = []
         self._asked: list[int] = []  # stamps at which a source wants a keyframe
         self._undetermined: dict[int, list[Wait]] = defaultdict(list)
-        self._counts: dict[str, dict[int, int]] = defaultdict(dict)
+        self._waits = 0  # ever
+        self._tallies: dict[str, _Tally] = defaultdict(_Tally)
 
     def __bool__(self) -> bool:
         return bool(self._pending)
@@ -38,8 +41,7 @@ class Waiting:
         source = self._sources.get(measurement.source)
         if source is None:
             raise BadConfig(f"there is no source '{measurement.source}'; known: {', '.join(self._sources)}")
-        counts = self._counts[measurement.source]
-        n = counts[measurement.stamp] = counts.get(measurement.stamp, -1) + 1
+        n = self._tallies[measurement.source].count(measurement.stamp)
         self._pending.append(Offer(identify(measurement, n), measurement))
         if getattr(source, "keyframe", False):
             for stamp in measurement.ends or (measurement.stamp,):
@@ -48,16 +50,8 @@ class Waiting:
 
     def _relieved(self) -> list[Decision]:
         """Looks at all that is pending; for once in a great many offers."""
-        held = Counter(offer.measurement.source for offer in self._pending)
-        decisions = []
-        for source, count in held.items():
-            if count > MOST_WAITING // 2 and source != self._driver:
-                ours = (offer for offer in self._pending if offer.measurement.source == source)
-                gone = list(islice(ours, count // 2))
-                ids = {offer.id for offer in gone}
-                self._pending = [offer for offer in self._pending if offer.id not in ids]
-                first = gone[0].measurement
-                decisions.append(decided(first, "refused", "wait/flood", float(count), count=len(gone)))
+        gone, decisions = _older_halves([o for o in self._pending if o.measurement.source != self._driver])
+        self._pending = [offer for offer in self._pending if offer.id not in gone]
         return decisions
 
     def again(self, offers: list[Offer]) -> None:
@@ -84,13 +78,24 @@ class Waiting:
         self._pending = [offer for offer in self._pending if not wanted(offer.measurement)]
         return taken
 
-    def wait(self, wait: Wait) -> Decision:
-        """Keep a measurement until its variable exists."""
+    def wait(self, wait: Wait) -> list[Decision]:
+        """Keep a measurement until its variable exists. Of a source of which too many wait in vain, the older half is dropped."""
         self._undetermined[wait.until].append(wait)
         m = wait.offer.measurement
-        return Decision(
+        told = Decision(
             m.stamp, wait.offer.id, m.source, "probation", "wait", "undetermined", wait.reason, ends=m.ends
         )
+        self._waits += 1
+        return [told] if self._waits % MOST_WAITING else [told, *self._despaired()]
+
+    def _despaired(self) -> list[Decision]:
+        """Looks at all that wait for a variable; for once in a great many."""
+        waits = [wait.offer for waits in self._undetermined.values() for wait in waits]
+        waits.sort(key=lambda offer: offer.measurement.stamp)
+        gone, decisions = _older_halves(waits)
+        for until, those in self._undetermined.items():
+            self._undetermined[until] = [wait for wait in those if wait.offer.id not in gone]
+        return decisions
 
     def wake(self, key: int) -> None:
         """A variable exists now, or parts were joined: what waited for it is offered again."""
@@ -109,9 +114,7 @@ class Waiting:
         """Ids that are taken: what is offered later gets others."""
         for id_ in ids:
             source, stamp, n = id_.split("/")
-            counts = self._counts[source]
-            stamp_ns = parse_stamp(stamp)
-            counts[stamp_ns] = max(counts.get(stamp_ns, -1), int(n))
+            self._tallies[source].remember(parse_stamp(stamp), int(n))
 
     def leftovers(self) -> list[Decision]:
         """At the end of the input: refuse what no keyframe ever covered, and what waited in vain."""
@@ -122,6 +125,46 @@ class Waiting:
             decisions += [refusal(wait.offer, "wait", "undetermined", wait.reason) for wait in waits]
         self._pending, self._undetermined = [], defaultdict(list)
         return decisions
+
+
+class _Tally:
+    """How many measurements of a source had the same stamp: in columns, since it grows with their number."""
+
+    def __init__(self) -> None:
+        self._stamps, self._newest = array("q"), array("i")
+
+    def count(self, stamp: int) -> int:
+        """The number of another measurement with this stamp, from 0 on."""
+        at = self._place(stamp)
+        self._newest[at] += 1
+        return self._newest[at]
+
+    def remember(self, stamp: int, n: int) -> None:
+        at = self._place(stamp)
+        self._newest[at] = max(self._newest[at], n)
+
+    def _place(self, stamp: int) -> int:
+        at = len(self._stamps)
+        if at and stamp <= self._stamps[-1]:
+            at = bisect_left(self._stamps, stamp)
+            if self._stamps[at] == stamp:
+                return at
+        self._stamps.insert(at, stamp)
+        self._newest.insert(at, -1)
+        return at
+
+
+def _older_halves(offers: Sequence[Offer]) -> tuple[set[str], list[Decision]]:
+    """Of each source that has more than its share of these: the ids of its older half, and one decision for all of it."""
+    gone: set[str] = set()
+    decisions = []
+    for source, count in Counter(offer.measurement.source for offer in offers).items():
+        if count > MOST_WAITING // 2:
+            older = list(islice((o for o in offers if o.measurement.source == source), count // 2))
+            gone |= {offer.id for offer in older}
+            first = older[0].measurement
+            decisions.append(decided(first, "refused", "wait/flood", float(count), count=len(older)))
+    return gone, decisions
 
 
 def refusal(offer: Offer, stage: str, reason: str, detail: str) -> Decision:

@@ -149,7 +149,7 @@ RULES: Mapping[str, Rule] = {
         "throttle the source; see that the driving source keeps coming", MOST_WAITING, "messages",
     ),
     "wait/flood": Rule(
-        "error", "more wait for a keyframe than memory should hold; the oldest are dropped",
+        "error", "more wait for a keyframe, or for their landmark, than memory should hold; the oldest are dropped",
         "throttle the source, or set keyframes.time so that a parked robot makes keyframes", MOST_WAITING, "messages",
     ),
     "*/uncovered": Rule("warn", "no trajectory at its stamp", f"see that the driving source covers it; {_CLOCK}"),
