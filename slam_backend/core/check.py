@@ -21,6 +21,7 @@ from .firewall.covariances import (
     judge_information,
     judge_noise,
 )
+from .firewall.repeats import Repeats
 from .firewall.rules import Fault, decided
 from .firewall.values import judge_pose, judge_sighting, judge_stamps
 from .graph import Decision
@@ -60,8 +61,9 @@ def checked(items: Stream, config: Config) -> Iterator[Measurement | Decision]:
 
 
 def rechecked(items: Stream, config: Config) -> Iterator[Measurement | Decision]:
-    """After settling: refuse duplicate and teleporting messages of odometry sources, and those from another frame."""
+    """After settling: refuse duplicate and teleporting odometry, what is told in another frame, and loops told twice."""
     tracks: dict[str, Continuity] = {}
+    repeats = Repeats()
     for item in items:
         if isinstance(item, OdometryPose):
             track = tracks.get(item.source)
@@ -69,6 +71,10 @@ def rechecked(items: Stream, config: Config) -> Iterator[Measurement | Decision]
                 pace = pace_of(item.source, config)
                 track = tracks[item.source] = Continuity(pace, SPACES[config.space])
             yield from track.judge(item)
+        elif isinstance(item, RelativePose) and repeats.told(item):
+            yield decided(item, "refused", "recheck/duplicate")
+        elif isinstance(item, AbsolutePose) and item.parent.strip("/") not in ("", config.map_frame):
+            yield decided(item, "refused", "recheck/other_frame")
         else:
             yield item
     for track in tracks.values():

@@ -415,6 +415,48 @@ def test_other_sources_pass_and_each_odometry_source_has_its_own_past():
     assert list(rechecked(items, settings)) == items
 
 
+def relative_rules(*items, settings=None) -> list[str]:
+    return [i.reason if isinstance(i, Decision) else "kept" for i in rechecked(items, settings or config())]
+
+
+def test_a_loop_that_is_told_twice_counts_once():
+    again = replace(loop(), stamp=9 * SECOND)  # sent once more, later
+    first, refused = rechecked([loop(), again], config())
+    assert isinstance(first, RelativePose)
+    assert (refused.id, refused.verdict, refused.ends) == ("loops/9.000000000", "refused", again.ends)
+    assert relative_rules(loop(), again, again) == ["kept", "duplicate", "duplicate"]
+
+
+def test_another_look_between_the_same_moments_is_no_repetition():
+    other = [
+        loop(pose=(1e-9, 0, 0, 0, 0, 0, 1)),
+        loop(stamps=(SECOND, 3 * SECOND)),
+        loop(stamps=(2 * SECOND, SECOND)),
+        replace(loop(), source="lidar"),
+        replace(loop(), frame_i="camera"),
+    ]
+    assert relative_rules(loop(), *other) == ["kept"] * 6
+
+
+def test_the_edges_of_a_graph_file_may_repeat():
+    edge = loop(information=np.eye(3))
+    assert relative_rules(edge, edge) == ["kept", "kept"]
+
+
+def test_only_the_newest_relative_poses_are_remembered(monkeypatch):
+    monkeypatch.setattr("slam_backend.core.firewall.repeats.MOST_WAITING", 10)
+    loops = [loop(stamps=(SECOND, n * SECOND)) for n in range(2, 14)]
+    assert relative_rules(*loops, loops[-10], loops[0]) == ["kept"] * 12 + ["duplicate", "kept"]
+
+
+def test_an_absolute_pose_must_be_in_the_map():
+    odom, settings = replace(localized(), parent="odom"), config()
+    assert relative_rules(odom, *(replace(localized(), parent=p) for p in ("", "map", "/map"))) == [
+        "other_frame", "kept", "kept", "kept",
+    ]  # fmt: skip
+    assert relative_rules(odom, settings=settings.model_copy(update={"map_frame": "odom"})) == ["kept"]
+
+
 def test_a_robot_without_covariances_passes_untouched():
     blank = replace(wheels(), covariance=UNKNOWN, twist_covariance=UNKNOWN)
     assert verdict(blank) == "kept"

@@ -85,7 +85,7 @@ RULES: Mapping[str, Rule] = {
         SILENCE, "s",
     ),
     "recheck/duplicate": Rule(
-        "warn", "a second message with this stamp", "look for two publishers, or a topic recorded twice"
+        "warn", "a second message with this stamp, or the same relative pose again", "look for two publishers, or a topic recorded twice"
     ),
     # -- values --------------------------------------------------------------------------------------------------
     "check/not_finite": Rule(
@@ -133,6 +133,9 @@ RULES: Mapping[str, Rule] = {
         "error", "the information is not positive definite", "mend the edge in the file", 0.0
     ),
     # -- frames and names ----------------------------------------------------------------------------------------
+    "recheck/other_frame": Rule(
+        "error", "an absolute pose that is not in the map's frame", "publish it in map_frame, or set that to the frame of this source"
+    ),
     "recheck/frame_changed": Rule(
         "error", "a message from another frame than those before and after", "look for two publishers on the topic"
     ),

@@ -14,18 +14,18 @@ from ..robust.kernels import noise_of
 
 @dataclass(frozen=True, slots=True, eq=False)
 class AbsolutePose(Measurement):
-    """`map_T_frame`; frame empty means the base."""
+    """`parent_T_frame`; frame empty means the base, parent empty the map."""
 
     frame: str
     pose: Array  # (7,)
     covariance: Array  # (36,) in ROS order
+    parent: str = ""
 
 
 def decode(message: Message, source: str) -> AbsolutePose:
     """geometry_msgs/msg/PoseWithCovarianceStamped."""
-    return AbsolutePose(
-        stamp_of(message), source, "", seven_of(message.pose.pose), frozen(message.pose.covariance)
-    )
+    pose, covariance = seven_of(message.pose.pose), frozen(message.pose.covariance)
+    return AbsolutePose(stamp_of(message), source, "", pose, covariance, message.header.frame_id)
 
 
 DECODERS: Mapping[str, Decoder] = {"geometry_msgs/msg/PoseWithCovarianceStamped": decode}
