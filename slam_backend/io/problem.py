@@ -103,11 +103,11 @@ def problem_of(graph: PoseGraph, kernel: KernelName = "none") -> Problem:
 
 
 def config_of(graph: PoseGraph, kernel: KernelName = "none") -> Config:
-    """The configuration with which `stream(..., apart=True)` can be replayed."""
+    """The configuration with which `stream(..., apart=True)` can be replayed; a graph file is believed as it is."""
     sources = {EDGES: {"kind": "relative"}, LOOPS: {"kind": "relative", "kernel": kernel}}
     if len(graph.sightings):
         sources[LANDMARKS] = {"kind": "landmark"}
-    return config_from({"space": graph.space, "sources": list(sources), **sources})
+    return config_from({"space": graph.space, "robust": [], "sources": list(sources), **sources})
 
 
 def odometry_edges(graph: PoseGraph) -> set[tuple[int, int]]:

@@ -39,7 +39,7 @@ def joins_two_stamps(status):
 
 
 def test_the_examples_do_what_they_say(backend, peer, drive) -> None:
-    """A loop closure by hand is taken; every request is answered with what it asks for."""
+    """A loop closure by hand is judged; every request is answered with what it asks for."""
     node = backend()
     told = peer.hear("/slam_backend/decisions", "diagnostic_msgs/msg/DiagnosticArray")
     odometry = [record for record in drive.records if record.topic == "/odom"]
@@ -67,4 +67,4 @@ def test_the_examples_do_what_they_say(backend, peer, drive) -> None:
     assert set(answers) == {"pause", "save"}
     assert all(answer.success for found in answers.values() for answer in found)
     assert len(list((node.folder / "runs").iterdir())) == 1
-    assert node.end()["counts"]["loops_accepted"] == 1
+    assert node.end()["counts"]["loops_offered"] == 1
