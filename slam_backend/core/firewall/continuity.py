@@ -38,7 +38,7 @@ class Pace:
             return Breach("recheck/frame_changed")
         n = self._dimension
         meters = dist(last.pose.tolist()[:n], item.pose.tolist()[:n])
-        seconds = max((item.stamp - last.stamp) / SECOND, 1e-9)
+        seconds = (item.stamp - last.stamp) / SECOND
         if meters <= self.max_speed * seconds + JITTER:
             return None
         return Breach("recheck/teleport", meters / seconds, self.max_speed)
@@ -67,7 +67,8 @@ class Continuity:
         if last is not None and item.stamp <= last.stamp:
             yield decided(item, "refused", "recheck/duplicate")
         elif last is None or (breach := self._pace.breach(last, item)) is None:
-            yield from self.drop_doubt()
+            if doubt is not None:
+                yield from self.drop_doubt()
             self._last = item
             yield self._shifted(item)
         elif doubt is not None and item.stamp == doubt.stamp:  # no witness: it may be the same message again
