@@ -7,6 +7,7 @@ import time
 
 import pytest
 
+from slam_backend.core.config import Config
 from slam_backend.core.errors import SlamError
 from slam_backend.io.configfile import load_config
 from slam_backend.ros.session import Session
@@ -17,12 +18,13 @@ from slam_backend.ros.state import State
 def session(tmp_path, drive):
     """A session that has heard some of the drive, its state, and what went wrong."""
     state, incidents = State(lambda: None), []
-    session = Session(tmp_path, state, incidents.append)
-    session.work(load_config(drive.config))
+    config = load_config(drive.config)
+    session = Session(tmp_path, state, incidents.append, config)
+    session.work(config)
     for record in drive.records[:300]:
         session.journal.append(record.topic, record.type, bytes(record.data))
     until(
-        lambda: session.feeder.backlog == 0 and session.journal.committed == 300 and state.update is not None
+        lambda: session.feeder.backlog == 0 and session.journal.committed >= 300 and state.update is not None
     )
     yield session, state
     os.kill(session.feeder.pid, signal.SIGCONT)
@@ -82,7 +84,7 @@ def test_the_end_of_a_session_ends_the_wait(session):
 
 
 def test_before_anything_is_known_there_is_nothing_to_do(tmp_path):
-    session = Session(tmp_path, State(lambda: None), print)
+    session = Session(tmp_path, State(lambda: None), print, Config())
     with pytest.raises(SlamError, match="nothing to optimize yet"):
         session.command("optimize", {}, 30)
     session.end(5)
