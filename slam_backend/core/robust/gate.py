@@ -19,7 +19,8 @@ from .held import Held
 from .paths import Path, Paths
 from .stage import Judged
 
-TRIALS = 24  # ways that a search for the smallest set of contradicting loops may look at
+TRIALS = 8  # ways that a search for the smallest set of contradicting loops may look at
+STIRRED = 6  # nearest refused loops that are judged anew where something has changed
 VOTERS = 6  # nearest accepted loops that are asked about a new one
 OUTVOTE = 2  # loops in favour, for each one against
 
@@ -202,7 +203,9 @@ class Gate:
                 self._suspects.pop(loop.id, None)
                 if loop.id not in self._given_up:
                     self._refused.add(loop)
-        return {near.id: near for loop in (*entered, *left) for near in self._refused.beside(loop)}.values()
+        return {
+            near.id: near for loop in (*entered, *left) for near in self._refused.beside(loop)[:STIRRED]
+        }.values()
 
     def _forget(self, id_: str) -> None:
         self._refused.drop(id_)
