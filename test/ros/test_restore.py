@@ -27,19 +27,30 @@ def left_of(records, rows):
     return [record for record in records if next(counts[record.topic]) >= rows.get(record.topic, 0)]
 
 
-def publish(peer, node, records):
-    """Each once, in order. A killed node looks alive to DDS for a while, so it does not tell when the new one listens."""
+def publish(peer, node, records, complete=()):
+    """Each once, in order, to the node that lives; then until the journal holds all of `complete`.
+
+    A killed node still looks alive to DDS: only a reader that was not there before tells that another one listens.
+    """
     topics = {record.topic: record.type for record in records}
+    dead = readers(peer, topics)
     publishers = {t: peer.publisher(t, k, latched=True) for t, k in topics.items()}
-    for topic in topics:
-        node.process.wait_for(f"listening to {topic} ")
-    peer.spin(1)
+    peer.until(lambda: {topic for topic, _ in readers(peer, topics) - dead} == set(topics))
+    peer.spin(0.2)
     for record in records:
         publishers[record.topic].publish(bytes(record.data))
         peer.spin(0.003)
-    peer.spin(0.1)
+    peer.until(lambda: not left_of(complete, node.rows()), why=lambda: f"the journal holds {node.rows()}")
     for publisher in publishers.values():
         peer.node.destroy_publisher(publisher)
+
+
+def readers(peer, topics):
+    return {
+        (t, tuple(found.endpoint_gid))
+        for t in topics
+        for found in peer.node.get_subscriptions_info_by_topic(t)
+    }
 
 
 @pytest.mark.parametrize(
@@ -54,12 +65,12 @@ def test_a_killed_node_goes_on_where_it_was(backend, peer, drive, configured) ->
     for upto in (2 * third, len(drive.records)):
         node = backend(config)
         node.process.wait_for("its session was not ended, and goes on")
-        publish(peer, node, left_of(drive.records[:upto], node.rows()))
+        last = upto == len(drive.records)
+        publish(peer, node, left_of(drive.records[:upto], node.rows()), drive.records if last else ())
         node.process.wait_for("restored: ")
-        if upto < len(drive.records):
+        if not last:
             killed(node, worker_first=True)
     summary = node.end()
-    assert not left_of(drive.records, node.rows())
     assert summary["run_hash"] == node.replayed()["run_hash"]
     if configured:
         replayed = sb.replay(drive.bag, sb.load_config(drive.config)).result.summary
