@@ -1,12 +1,14 @@
 """An estimate that another solver found for the factors of this one."""
 
 from collections.abc import Sequence
+from typing import Any
 
 import gtsam
 
 from .graph import Estimate, Pose
 from .measurement import Array
 from .space import Space
+from .variables import value_in
 
 
 class Adopted:
@@ -20,6 +22,9 @@ class Adopted:
 
     def point(self, key: int) -> Array:
         return self._space.point_in(self._values, key)
+
+    def value(self, key: int) -> Any:
+        return value_in(self._space, self._values, key)
 
     def knows(self, key: int) -> bool:
         return bool(self._values.exists(key))

@@ -4,15 +4,13 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
-import numpy as np
-
 from .errors import SolverFailure
 from .graph import UNTIL_JOINED, Decision, Delta, Estimate, Factor, Pose, is_pose
-from .measurement import Array
 from .parts import Parts
 from .sessions import SavedMap
 from .solvers import Solver
-from .space import Space, value_in
+from .space import Space
+from .variables import moved, seen_from, value_in
 
 FOUNDATION = frozenset({"gauge", "motion"})  # kinds without which a keyframe cannot be
 
@@ -42,8 +40,8 @@ class Applier:
         self._verdicts: Mapping[str, Decision] = {}
         self.estimate: Estimate | None = None
         self.sighted: dict[
-            int, tuple[int, Array]
-        ] = {}  # landmark -> the pose that saw it first, and where from there
+            int, tuple[int, Any]
+        ] = {}  # variable other than a keyframe's pose -> the first pose that it was tied to, and the value from there
         self.decisions: list[Decision] = []
 
     def take_decisions(self) -> list[Decision]:
@@ -136,12 +134,8 @@ class Applier:
         """The variables of a part, moved as a whole."""
         assert self.estimate is not None
         values, space = self.estimate.values(), self._space
-        return {
-            key: shift.compose(space.pose_in(values, key))
-            if is_pose(key)
-            else shift.transformFrom(space.point_in(values, key))
-            for key in self._parts.members(part)
-        }
+        members = self._parts.members(part)
+        return {key: moved(shift, key, value_in(space, values, key)) for key in members}
 
     def replace(
         self, estimate: Estimate, parts: Parts, added: Sequence[Factor], removed: Sequence[str]
@@ -190,13 +184,11 @@ class Applier:
                 self.decisions.append(self._verdicts.get(factor.id) or _accepted(factor))
         self._booked(delta)
 
-    def _from(self, pose_key: int, delta: Delta, key: int) -> Array:
-        """The first guess of a landmark, seen from a pose."""
+    def _from(self, pose_key: int, delta: Delta, key: int) -> Any:
+        """The first guess of a variable, seen from a pose."""
         assert self.estimate is not None
         pose = delta.values.get(pose_key)
-        return np.asarray(
-            (self.estimate.pose(pose_key) if pose is None else pose).transformTo(delta.values[key])
-        )
+        return seen_from(self.estimate.pose(pose_key) if pose is None else pose, key, delta.values[key])
 
 
 def shift_of(event: Factor, poses: Sequence[Pose], last: bool) -> Pose:

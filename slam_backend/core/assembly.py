@@ -6,17 +6,20 @@ each other first, as when they were joined for the first time (see apply.py).
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import gtsam
 
 from .apply import shift_of
 from .graph import Factor, is_pose
 from .growth import gauge
-from .measurement import Array
 from .parts import Parts
 from .space import Space
+from .variables import moved, value_in
 
-Sighted = Mapping[int, tuple[int, Array]]  # landmark -> the pose that saw it first, and where from there
+Sighted = Mapping[
+    int, tuple[int, Any]
+]  # variable -> the first pose that it was tied to, and the value from there
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -65,7 +68,7 @@ class _Builder:
             if self.parts.of(key) is None:
                 self.parts.put(key, first)
                 if self._before.exists(key):
-                    self.values.insert(key, self._space.point_in(self._before, key))
+                    self.values.insert(key, value_in(self._space, self._before, key))
                 continue
             kept, gone = sorted((self._part(first), self._part(key)))
             if kept != gone:
@@ -86,18 +89,16 @@ class _Builder:
         part, poses = max(loose), [self._space.pose_in(self.values, key) for key in factor.keys]
         shift = shift_of(factor, poses, last=self._part(factor.keys[-1]) == part)
         for key in self.parts.members(part):
-            if is_pose(key):
-                self.values.update(key, shift.compose(self._space.pose_in(self.values, key)))
-            elif self.values.exists(key):
-                self.values.update(key, shift.transformFrom(self._space.point_in(self.values, key)))
+            if self.values.exists(key):
+                self.values.update(key, moved(shift, key, value_in(self._space, self.values, key)))
 
     def place(self, sighted: Sighted) -> None:
-        """Landmarks that are back: where they were seen first."""
+        """Variables that are back: where they were seen first."""
         for part in self.parts.numbers:
             for key in self.parts.members(part):
                 if not self.values.exists(key):
-                    pose, point = sighted[key]
-                    self.values.insert(key, self._space.pose_in(self.values, pose).transformFrom(point))
+                    pose, seen = sighted[key]
+                    self.values.insert(key, moved(self._space.pose_in(self.values, pose), key, seen))
 
     def held(self, gauges: Iterable[Factor], stamp_of: Callable[[int], int]) -> list[Factor]:
         """A gauge for each part that floats: its earliest so far, or a new one at its first pose."""

@@ -44,6 +44,7 @@ from .settle import FAR
 from .solvers import SOLVERS, Solver
 from .space import SPACES
 from .trajectory import Snapshot, Trajectory
+from .variables import moved
 from .waiting import Waiting
 
 SOURCES = {  # of a configuration that names none: one of each kind, by the name of its kind
@@ -235,8 +236,8 @@ class Backend:
             for each in keyframes:
                 if track.covers(each.stamp):
                     values.insert(each.pose, start.compose(track.pose(each.stamp)))
-        for key, (pose_key, point) in self._applier.sighted.items():
-            values.insert(key, self.space.pose_in(values, pose_key).transformFrom(point))
+        for key, (pose_key, seen) in self._applier.sighted.items():
+            values.insert(key, moved(self.space.pose_in(values, pose_key), key, seen))
         return values
 
     # -- the way of a measurement ----------------------------------------------------------------

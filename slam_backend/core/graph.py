@@ -142,6 +142,10 @@ class Estimate(Protocol):
 
     def point(self, key: int) -> Array: ...
 
+    def value(self, key: int) -> Any:
+        """Of any variable, as its kind is (variables.py)."""
+        ...
+
     def knows(self, key: int) -> bool: ...
 
     def values(self) -> gtsam.Values:

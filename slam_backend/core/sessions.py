@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
+from typing import Any
 
 import gtsam
 import numpy as np
@@ -9,7 +10,6 @@ import numpy as np
 from .errors import SlamError
 from .graph import Factor, Keyframe
 from .keyframes import Samples, Track
-from .measurement import Array
 from .trajectory import Trajectory
 
 
@@ -18,7 +18,7 @@ class SavedMap:
     """All that a back-end must know of a map to go on in it.
 
     values: of every variable. keyframes: in order of index. landmarks: name -> key. parts: variable -> number of its
-    component. sighted: landmark -> the pose that saw it first, and where from there. tracks: the odometry of each session, in
+    component. sighted: variable other than a keyframe's pose -> the first pose that it was tied to, and the value from there. tracks: the odometry of each session, in
     order of time. online: what was believed of each keyframe when it was newest.
     """
 
@@ -28,7 +28,7 @@ class SavedMap:
     keyframes: tuple[Keyframe, ...]
     landmarks: Mapping[str, int]
     parts: Mapping[int, int]
-    sighted: Mapping[int, tuple[int, Array]]
+    sighted: Mapping[int, tuple[int, Any]]
     tracks: tuple[Samples, ...]
     online: Trajectory
     revision: int

@@ -14,7 +14,7 @@ import gtsam
 import numpy as np
 
 from .geometry import covariance_from_ros, covariance_to_ros, seven_of_matrix
-from .graph import Pose, is_pose
+from .graph import Pose
 from .measurement import Array
 
 ZENITH = 1e-3  # least change of direction per radian of azimuth, which has no effect straight up
@@ -106,11 +106,6 @@ class Space(Protocol):
     def sevens_of(self, numbers: Array) -> Array:
         """Rows of `numbers` to (N, 7)."""
         ...
-
-
-def value_in(space: Space, values: gtsam.Values, key: int) -> Any:
-    """Pose or point, by its key."""
-    return space.pose_in(values, key) if is_pose(key) else space.point_in(values, key)
 
 
 def interpolate(space: Space, start: Pose, end: Pose, ratio: float) -> Pose:

@@ -6,7 +6,7 @@
     keyframe_stamps                 (K,) by index
     names, name_keys                (L,) of the landmarks
     keys, parts                     (V,) the component of each variable
-    seen, seen_from, seen_at        (S,) landmarks, the pose that saw each first, and where from there (S, 2 or 3)
+    seen, seen_from, seen_at        (S,) variables other than keyframes, the first pose that each was tied to, and (bytes) values from there
     track_sizes, track_stamps, track_numbers, track_strands, track_covariances    the odometry of each session, one after the other
     online_stamps, online_sevens    what was believed of each keyframe when it was newest
 
@@ -14,6 +14,7 @@ graph.g2o cannot serve: it has no gauges, kernels, ids, bearings. gtsam's own te
 """
 
 import zlib
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 from zipfile import BadZipFile
@@ -25,10 +26,12 @@ from ..core.errors import BadFile
 from ..core.graph import Factor, keyframe
 from ..core.keyframes import Samples
 from ..core.sessions import SavedMap
+from ..core.space import SPACES
 from ..core.trajectory import Trajectory
+from ..core.variables import value_in
 
 NAME = "map.npz"
-VERSION = 1
+VERSION = 2
 
 
 def write_map(path: Path, saved: SavedMap) -> None:
@@ -49,7 +52,7 @@ def write_map(path: Path, saved: SavedMap) -> None:
         names=_texts(saved.landmarks), name_keys=_keys(saved.landmarks.values()),
         keys=_keys(saved.parts), parts=_keys(saved.parts.values()),
         seen=_keys(key for key, _ in seen), seen_from=_keys(pose for _, (pose, _) in seen),
-        seen_at=np.array([point for _, (_, point) in seen]),
+        seen_at=_packed(_values((key, value) for key, (_, value) in seen).serialize()),
         track_sizes=_integers(len(track.stamps) for track in saved.tracks),
         track_stamps=np.concatenate([track.stamps for track in saved.tracks]),
         track_numbers=np.concatenate([track.numbers for track in saved.tracks]),
@@ -110,12 +113,15 @@ def _map(arrays: dict[str, Any]) -> SavedMap:
     parts = dict(zip(arrays["keys"].tolist(), arrays["parts"].tolist(), strict=True))
     if set(parts) != set(values.keys()) or not parts:
         raise ValueError("its variables do not fit its factors")
-    sighted = zip(arrays["seen"].tolist(), arrays["seen_from"].tolist(), arrays["seen_at"], strict=True)
+    space = SPACES[str(arrays["space"])]
+    seen = gtsam.Values()
+    seen.deserialize(_unpacked(arrays["seen_at"]))
+    sighted = zip(arrays["seen"].tolist(), arrays["seen_from"].tolist(), strict=True)
     return SavedMap(
-        str(arrays["space"]), tuple(factors), values,
+        space.name, tuple(factors), values,
         tuple(keyframe(n, stamp) for n, stamp in enumerate(arrays["keyframe_stamps"].tolist())),
         dict(zip(arrays["names"].tolist(), arrays["name_keys"].tolist(), strict=True)), parts,
-        {key: (pose, point) for key, pose, point in sighted},
+        {key: (pose, value_in(space, seen, key)) for key, pose in sighted},
         _tracks(arrays), Trajectory(arrays["online_stamps"], arrays["online_sevens"]),
         int(arrays["revision"]), str(arrays["run_hash"]),
     )  # fmt: skip
@@ -135,6 +141,13 @@ def _covariances(tracks: tuple[Samples, ...]) -> Any:
     """All sessions have them, or none is kept."""
     every = [track.covariances for track in tracks]
     return np.concatenate(every) if all(len(each) for each in every) else np.zeros(0)
+
+
+def _values(pairs: Iterable[tuple[int, Any]]) -> gtsam.Values:
+    values = gtsam.Values()
+    for key, value in pairs:
+        values.insert(key, value)
+    return values
 
 
 def _packed(text: str) -> Any:

@@ -25,6 +25,7 @@ from ..core.graph import Decision, Delta, Estimate, Factor, Pose, is_pose
 from ..core.measurement import Array
 from ..core.solvers import SOLVERS, Solver
 from ..core.space import Space
+from ..core.variables import value_in
 
 CLONES = 100  # keyframes in the state: what a filter can pay for at every step
 BATCH = 25  # so many more before the oldest are forgotten together: the covariance is copied then
@@ -96,6 +97,9 @@ class Ekf:
 
     def point(self, key: int) -> Array:
         return self._space.point_in(self._state.values, key)
+
+    def value(self, key: int) -> Any:
+        return self.pose(key) if is_pose(key) else value_in(self._space, self._state.values, key)
 
     def knows(self, key: int) -> bool:
         return key in self._state.columns or key in self._past

@@ -21,9 +21,10 @@ import numpy as np
 from ..config import Config
 from ..errors import SolverFailure
 from ..firewall.rules import FARTHEST
-from ..graph import Decision, Delta, Estimate, Factor, Pose, is_pose
+from ..graph import Decision, Delta, Estimate, Factor, Pose
 from ..measurement import Array
 from ..space import Space
+from ..variables import estimate_in, largest
 
 SETTLED = 1e-10  # largest change of a variable (m, rad) at which a rebuild is done
 ROUNDING = 1e-10  # relative change of the cost at which a step that no longer shrinks is only rounding
@@ -118,10 +119,7 @@ class Isam2:
         """Garbage without a throw: what the change adds or joins must be finite, and on this planet."""
         joined = (key for factor in delta.add if factor.kind in JOINING for key in factor.keys)
         for key in {**delta.values, **dict.fromkeys(joined)}:
-            found = (
-                self._space.numbers(self._believed.pose(key)) if is_pose(key) else self._believed.point(key)
-            )
-            if not all(abs(number) < FARTHEST for number in found):
+            if not largest(self._space, key, self._believed.value(key)) < FARTHEST:
                 raise RuntimeError(
                     f"estimate is not finite, or leaves the world, near variable {gtsam.DefaultKeyFormatter(key)}"
                 )
@@ -274,6 +272,9 @@ class Believed:
 
     def point(self, key: int) -> Array:
         return self._solver._space.estimate_point(self._isam, key)  # noqa: SLF001
+
+    def value(self, key: int) -> Any:
+        return estimate_in(self._solver._space, self._isam, key)  # noqa: SLF001
 
     def knows(self, key: int) -> bool:
         return bool(self._isam.valueExists(key))

@@ -12,9 +12,10 @@ from typing import Any
 import gtsam
 import numpy as np
 
-from ..graph import Factor, is_pose
+from ..graph import Factor
 from ..measurement import Array
 from ..space import SPACES
+from ..variables import is_posed
 
 SMALL = 1e-3  # rad; below, the series are exact to the last digit
 
@@ -59,7 +60,7 @@ class Planar:
             return values.retract(linear.optimize(gtsam.EliminateQR))
 
     def _linear(self, values: gtsam.Values) -> gtsam.GaussianFactorGraph:
-        keys = np.array([key for key in values.keys() if is_pose(key)], dtype=np.uint64)  # noqa: SIM118  # no mapping
+        keys = np.array([key for key in values.keys() if is_posed(key)], dtype=np.uint64)  # noqa: SIM118  # no mapping
         poses = gtsam.utilities.extractPose2(values)  # in the order of the keys
         linear, noise = gtsam.GaussianFactorGraph(), gtsam.noiseModel.Unit.Create(3)
         i, j = (poses[np.searchsorted(keys, self._edges.keys[:, end])] for end in (0, 1))
