@@ -11,12 +11,14 @@ from gtsam import symbolIndex
 
 from .adopted import Adopted
 from .apply import Applier, touched, without
+from .beside import Beside
 from .command import Command
 from .config import Config, LandmarkSource, OdometrySource, PoseSource, RelativeSource
 from .context import Context
 from .editor import Editor, Shift
 from .edits import Wishes
 from .errors import BadConfig, SlamError, SolverFailure
+from .floor import priors
 from .graph import (
     Decision,
     Delta,
@@ -30,14 +32,14 @@ from .graph import (
 )
 from .growth import Growth
 from .keyframes import Timeline, Track, due
-from .measurement import Array, Measurement, StaticTransform
+from .measurement import SECOND, Measurement, StaticTransform
 from .mounts import Mounts
 from .parts import Parts
 from .reunion import Reunion, reunion
 from .robust import ROBUST, Robust
 from .robust.paths import Paths
 from .sensors import SENSORS
-from .sensors.odometry import OdometryPose
+from .sensors.odometry import HERE, OdometryPose, stated
 from .sensors.relative import RelativePose
 from .sessions import SavedMap, Tracks, fits, joined
 from .settle import FAR
@@ -59,7 +61,8 @@ SOURCES = {  # of a configuration that names none: one of each kind, by the name
 class Update:
     """What one keyframe changed; plain data, small enough to send each time.
 
-    pose: `map_T_base` of the keyframe; correction: `map_T_odom`; both x y z qx qy qz qw.
+    pose: `map_T_base` of the keyframe; correction: `map_T_odom`; both x y z qx qy qz qw. origin: where the driving odometry's frame
+    has been since its last restart, in that odom.
     revision: grows whenever a solver update corrects the newest pose noticeably.
     """
 
@@ -68,6 +71,7 @@ class Update:
     correction: tuple[float, ...]
     revision: int
     decisions: tuple[Decision, ...]
+    origin: tuple[float, ...] = HERE
 
 
 class Backend:
@@ -93,14 +97,18 @@ class Backend:
         if self._driver is None:
             raise BadConfig("no source drives the keyframes: add one of kind odometry or relative")
         driving = config.sources[self._driver]
-        if second := [n for n, s in config.sources.items() if s.kind == "odometry" and n != self._driver]:
-            raise BadConfig(f"source '{second[0]}': a second odometry; '{self._driver}' drives the keyframes")
         self._relative = driving.kind == "relative"
         self.track = Track(space, driving if isinstance(driving, OdometrySource) else OdometrySource())
         self.tracks = Tracks(self.track)
         self.timeline = Timeline()
         self.parts = Parts()
         self._mounts = Mounts(space, config.base_frame, config.extrinsics)
+        self._beside = {
+            name: Beside(name, source, space, self._mounts)
+            for name, source in config.sources.items()
+            if isinstance(source, OdometrySource) and name != self._driver
+        }
+        self._epoch, self._origin = 0, HERE  # of the driving odometry
         self._landmarks: dict[str, int] = {}
         self._waiting = Waiting(config)
         self._is_complete = False  # nothing was offered since the last keyframes along edges were made
@@ -148,6 +156,9 @@ class Backend:
             return self._carry_out(measurement)
         if isinstance(measurement, OdometryPose) and measurement.source == self._driver:
             return self._drive(measurement)
+        if isinstance(measurement, OdometryPose) and measurement.source in self._beside:
+            self._decisions += self._beside[measurement.source].add(measurement, bool(self._newest))
+            return []
         if self._relative and isinstance(measurement, RelativePose) and measurement.source == self._driver:
             self._mounts.name_base(measurement.frame_j)
         updates = self.complete(measurement.stamp)
@@ -174,6 +185,8 @@ class Backend:
         while self._newest and self._waiting:  # what was waiting for that, or was put back
             updates += self._close(last=True)
         self._decisions += self._waiting.leftovers()
+        if self._newest and (edges := self._edges_beside()):
+            updates += self._update(self._newest[0], Delta(edges), [], [])
         if self._newest and self._robust:
             self._paths.ended = True
             self._judge(Delta())
@@ -246,7 +259,11 @@ class Backend:
         """The driving odometry moves on: keyframes that were asked for, then one of its own if it is due."""
         self._mounts.name_base(odometry.child)
         pose = self.space.pose(odometry.pose.tolist())
-        self.track.add(odometry.stamp, pose, self._odometry_noise(odometry, pose))
+        restarted = odometry.epoch != self._epoch and len(self.track) > 0
+        self._epoch, self._origin = odometry.epoch, odometry.origin
+        seconds = (odometry.stamp - self.track.newest) / SECOND if len(self.track) else 0.0
+        noise = stated(self.space, self.track.noise, odometry, seconds)
+        (self.track.leap if restarted else self.track.add)(odometry.stamp, pose, noise)
         updates: list[Update] = []
         for stamp in self._waiting.asked(odometry.stamp):
             if self.track.covers(stamp) and (self._newest is None or stamp > self._newest[0].stamp):
@@ -254,22 +271,11 @@ class Backend:
         if self._newest is None:
             return updates + self._extend(odometry.stamp)
         newest, there = self._newest
-        if odometry.stamp > newest.stamp and due(
-            self.config.keyframes, self.space, there.between(pose), odometry.stamp - newest.stamp
-        ):
+        elapsed = odometry.stamp - newest.stamp
+        moved = there.between(pose)
+        if elapsed > 0 and (restarted or due(self.config.keyframes, self.space, moved, elapsed)):
             updates += self._extend(odometry.stamp)
         return updates
-
-    def _odometry_noise(self, odometry: OdometryPose, pose: Pose) -> Array | None:
-        """What the track's noise mode needs of a message: of its step, of its pose, or nothing."""
-        source = self.config.sources[odometry.source]
-        assert isinstance(source, OdometrySource)
-        if source.noise == "pose":
-            return self.space.covariance(odometry.covariance, pose)
-        if source.noise == "twist":
-            elapsed = (odometry.stamp - self.track.newest) / 1e9 if len(self.track) else 0.0
-            return self.space.twist_covariance(odometry.twist_covariance) * elapsed**2
-        return None
 
     def _extend(self, stamp: int) -> list[Update]:
         """A new keyframe at a stamp that the odometry covers, with everything that lands there."""
@@ -284,7 +290,13 @@ class Backend:
         self._newest = (b, self.track.pose(stamp))
         self.track.protect()
         window = self._waiting.window(stamp)
-        return self._update(b, delta + self._factors(window, a, b, delta.values), [b], window)
+        delta += Delta(self._edges_beside()) + self._factors(window, a, b, delta.values)
+        return self._update(b, delta, [b], window)
+
+    def _edges_beside(self) -> tuple[Factor, ...]:
+        """By the odometries that do not drive."""
+        keyframes, context = self.timeline.keyframes, self._context({})
+        return tuple(edge for each in self._beside.values() for edge in each.edges(keyframes, context))
 
     def _close(self, last: bool = False) -> list[Update]:
         """Without odometry: the measurements of one stamp are complete; their edges make the keyframes.
@@ -372,6 +384,7 @@ class Backend:
         self, b: Keyframe, delta: Delta, new: Sequence[Keyframe], window: Sequence[Offer]
     ) -> list[Update]:
         """Solve: motion and all that nothing judges first, then what the robust stages let in."""
+        delta += Delta(tuple(priors(self.config.floor, new)))
         self._decisions += delta.decisions
         self._decisions += [told for each in delta.waits for told in self._waiting.wait(each)]
         judged = tuple(f for f in delta.add if any(f.kind in stage.kinds for stage in self._robust))
@@ -457,6 +470,8 @@ class Backend:
         else was to land here.
         """
         estimate = self._applier.estimate
+        for each in self._beside.values():
+            each.rewind()
         for gone in reversed(new):
             if estimate is None or not estimate.knows(gone.pose):
                 self.timeline.drop(gone)
@@ -476,4 +491,5 @@ class Backend:
         decisions = (*self._decisions, *self._applier.take_decisions())
         self._decisions = []
         self._editor.note(decisions)
-        return Update(b, self.space.seven(pose), self.space.seven(correction), self._revision, decisions)
+        sevens = self.space.seven(pose), self.space.seven(correction)
+        return Update(b, *sevens, self._revision, decisions, self._origin)

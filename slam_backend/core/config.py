@@ -209,6 +209,18 @@ class Rrr(Section):
     )
 
 
+class Floor(Section):
+    """Where a robot on a floor is in space 3d. Off as it stands: each number that is given adds a prior to every keyframe."""
+
+    z: float | None = Field(None, gt=0, le=1e6, description="m around 0: height of the base in the map")
+    tilt: float | None = Field(
+        None,
+        gt=0,
+        le=3.2,
+        description="rad by which the base's z leans from the map's, each way (roll and pitch)",
+    )
+
+
 class PathOutput(Section):
     """The node's ~/path: for eyes; complete trajectories go on ~/trajectory."""
 
@@ -236,7 +248,9 @@ class Observing(Source):
 
 
 class OdometrySource(Source):
-    """Pose of the base in a drifting frame; the first odometry source drives the keyframes."""
+    """Pose of the base, or of a sensor on it, in a drifting frame. The first odometry source drives the keyframes; others add edges
+    between them.
+    """
 
     kind: Literal["odometry"] = "odometry"
     noise: Literal["model", "twist", "pose"] = Field(
@@ -261,7 +275,18 @@ class OdometrySource(Source):
     sigma_rotation_floor: float = Field(
         0.0005, gt=0, le=1e6, description="rad, added to every edge between keyframes"
     )
+    planar: bool = Field(
+        False,
+        description="space 3d: only x, y and yaw of its motion are known (wheels); the rest is left to others",
+    )
     max_speed: float = Field(100.0, gt=0, description="m/s; a faster step is a teleport and is refused")
+    sigma_acceleration: float = Field(
+        1.0,
+        gt=0,
+        le=1e6,
+        description="m/s^2 in 1 s, white: how far constant velocity is believed where the odometry has restarted",
+    )
+    sigma_angular_acceleration: float = Field(1.0, gt=0, le=1e6, description="rad/s^2 in 1 s, likewise")
 
 
 class RelativeSource(Observing):
@@ -338,6 +363,7 @@ class Config(Section):
         description="when stamps of the driving source jump back (a looped bag): start anew, or refuse them",
     )
     journal: Journaling = Journaling()
+    floor: Floor = Floor()
     path: PathOutput = PathOutput()
     extrinsics: Mapping[str, tuple[float, float, float, float, float, float]] = Field(
         default_factory=dict,
@@ -352,10 +378,12 @@ class Config(Section):
         for name in self.sources:
             if not name or "/" in name or "@" in name:
                 raise ValueError(f"source name '{name}' must not be empty or contain '/' or '@'")
-            if name in Config.model_fields or name in ("gauge", "command"):
+            if name in Config.model_fields or name in ("gauge", "command", "floor"):
                 raise ValueError(f"a source cannot be called '{name}': that name has a meaning of its own")
         if len(set(self.robust)) < len(self.robust):
             raise ValueError(f"'robust' names '{max(self.robust, key=self.robust.count)}' twice")
+        if self.space == "2d" and (self.floor.z or self.floor.tilt):
+            raise ValueError("'floor' needs space: 3d; in 2d nothing leaves the plane")
         if self.sources and self.driver is None:
             raise ValueError("no source drives the keyframes: add one of kind odometry or relative")
         return self

@@ -13,7 +13,9 @@ from .graph import Factor
 from .measurement import Array
 from .trajectory import Snapshot, Stamps
 
-EVERYDAY = frozenset({"motion", "landmark", "gauge"})  # kinds of factors that are only counted
+EVERYDAY = frozenset(
+    {"motion", "odometry", "landmark", "floor", "gauge"}
+)  # kinds of factors that are only counted
 STILL = 1e-6  # m or rad: less is rounding
 
 

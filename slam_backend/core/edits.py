@@ -22,6 +22,7 @@ from .settle import FAR
 
 Out = Literal["disabled", "removed"]
 EVERY = "all"
+UNMEANT = frozenset({"motion", "odometry", "floor"})  # kinds that it does not mean
 FACTORS = "a factor's id, a source, 'all', or one of these with @<from>,<to>"
 
 
@@ -126,7 +127,7 @@ def selected(name: str, factors: Sequence[Factor]) -> list[str]:
         factor.id
         for factor in factors
         if begin <= factor.stamp <= end
-        and (factor.source == source or (source == EVERY and factor.kind != "motion"))
+        and (factor.source == source or (source == EVERY and factor.kind not in UNMEANT))
     ]
     if not found:
         when = f" between {format_stamp(begin)} and {format_stamp(end)}" if span else ""

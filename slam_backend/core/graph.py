@@ -47,7 +47,8 @@ class Factor:
     """A GTSAM factor and where it came from; the id is the same in every replay.
 
     id: `<source>/<stamp>/<n>`, n counting the measurements of that source with that stamp.
-    kind: motion, loop, landmark, pose or gauge; what reports, robust stages and exports sort by.
+    kind: motion (it made a keyframe), odometry (beside that), loop, landmark, pose, floor or gauge; what reports, robust stages and
+    exports sort by.
     stamp: of the measurement; stamps: of its two ends, for relative measurements.
     """
 

@@ -20,6 +20,8 @@ from .measurement import SECOND, Array
 from .space import Space, interpolate
 from .trajectory import Stamps, Trajectory
 
+LOOSE = 1.0  # m and rad after 1 m or 1 rad: grounds are less uneven
+LOST = 3.2  # rad: nothing is known of a rotation
 SAMPLES_PER_STEP = 32  # odometry samples kept between two keyframes; a parked robot must not fill the memory
 
 
@@ -45,6 +47,8 @@ class Track:
                growth on axes whose variance is zero
         pose   the pose covariance at the end minus that at the start, seen from the end; the model where
                the difference is not positive definite (covariances that shrink or stand still)
+    Across a restart nothing was measured: there the robot is thought to go on at constant velocity, disturbed by white noise on its
+    acceleration (Barfoot, State Estimation for Robotics, 2017, ch. 11).
     """
 
     def __init__(self, space: Space, noise: OdometrySource) -> None:
@@ -55,6 +59,7 @@ class Track:
         ] = ()  # of Space.numbers, one row per sample: a tuple takes five times the room
         self._covariances: list[Array] = []  # per sample; only for noise `twist` (of the step) and `pose`
         self._protected = 0  # index of the newest sample that may not be thinned away
+        self._leaps: list[tuple[int, int, Array]] = []  # (before, after, covariance) of each restart
         self._strands: dict[
             int, int
         ] = {}  # stamp -> strand, of samples that share no frame with the first ones
@@ -79,6 +84,27 @@ class Track:
             self._covariances.insert(at, covariance)
         if len(self._stamps) - self._protected > 2 * SAMPLES_PER_STEP:
             self._thin()
+
+    def leap(self, stamp: int, pose: Pose, covariance: Array | None = None) -> None:
+        """Append the first sample after a restart."""
+        before = self._stamps[-1]
+        self.add(stamp, pose, covariance)
+        seconds = (stamp - before) / SECOND
+        turned, moved = self.noise.sigma_angular_acceleration**2, self.noise.sigma_acceleration**2
+        turned = min(turned * seconds**3 / 3, LOST**2)
+        self._leaps.append((before, stamp, self._space.diagonal(turned, moved * seconds**3 / 3)))
+
+    def beside(self, stamp: int) -> tuple[int, int]:
+        """The stamps of the samples before and after one that is covered; twice the same where it is a sample's own."""
+        right = bisect_left(self._stamps, stamp)
+        after = self._stamps[right]
+        return (after, after) if after == stamp else (self._stamps[right - 1], after)
+
+    def forget(self, stamp: int) -> None:
+        """What is older than a stamp that is covered will not be asked for any more."""
+        gone = max(bisect_right(self._stamps, stamp) - 1, 0)
+        self._drop(slice(0, gone))
+        self._protected = max(self._protected - gone, 0)
 
     def protect(self) -> None:
         """A keyframe stands at the newest sample: what follows is a new step."""
@@ -154,13 +180,25 @@ class Track:
         return np.ascontiguousarray(np.array(self._columns).T)
 
     def _covariance(self, start: int, end: int, motion: Pose, last: Pose) -> Array:
+        grown: Array | None = None
         if self.noise.noise == "twist" and self._covariances:
-            return self._floor() + self._of_twists(start, end, last)
+            grown = self._of_twists(start, end, last)
         if self.noise.noise == "pose" and self._covariances:
             grown = self._of_poses(start, end, motion)
-            if grown is not None:
-                return self._floor() + grown
-        return self._floor() + growth(self._space, self.noise, motion)
+        if grown is None:
+            grown = growth(self._space, self.noise, motion)
+        elif self.noise.planar:
+            grown = self._space.flat(grown, *loose(self._space, motion))
+        return self._floor() + grown + self._of_leaps(start, end, last)
+
+    def _of_leaps(self, start: int, end: int, last: Pose) -> Array:
+        total = np.zeros((self._space.dimension,) * 2)
+        for before, after, covariance in self._leaps:
+            if start < after and before < end:
+                share = (min(after, end) - max(before, start)) / (after - before)
+                adjoint = last.between(self.pose(min(after, end))).AdjointMap()
+                total += share * (adjoint @ covariance @ adjoint.T)
+        return total
 
     def _floor(self) -> Array:
         noise = self.noise
@@ -210,7 +248,9 @@ class Track:
                 self._covariances[i + 1] = (
                     self._covariances[i + 1] + adjoint @ self._covariances[i] @ adjoint.T
                 )
-        where = slice(drop.start, drop.stop, 2)
+        self._drop(slice(drop.start, drop.stop, 2))
+
+    def _drop(self, where: slice) -> None:
         del self._stamps[where]
         for column in self._columns:
             del column[where]
@@ -221,10 +261,17 @@ class Track:
 def growth(space: Space, noise: OdometrySource, motion: Pose) -> Array:
     """Covariance of a stretch by the model: with the distance and the angle between its ends, without the floor."""
     meters, radians = space.size(motion)
-    return space.diagonal(
+    grown = space.diagonal(
         noise.sigma_rotation_per_meter**2 * meters + noise.sigma_rotation_per_radian**2 * radians,
         noise.sigma_translation_per_meter**2 * meters + noise.sigma_translation_per_radian**2 * radians,
     )
+    return space.flat(grown, *loose(space, motion)) if noise.planar else grown
+
+
+def loose(space: Space, motion: Pose) -> tuple[float, float]:
+    """Variances of rotation and translation over a stretch, on axes that a planar odometry does not see."""
+    size = sum(space.size(motion))
+    return LOOSE**2 * size, LOOSE**2 * size
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -38,11 +38,17 @@ class Mounts:
         if frame in ("", "base", self._base):
             return self._space.identity
         if frame not in self._found:
-            found = self._given.get(frame) or self._search(frame)
+            found = self.whole(frame)
             if found is None:
                 return None
             self._found[frame] = self._space.pose(SPATIAL.seven(found))
         return self._found[frame]
+
+    def whole(self, frame: str) -> Pose | None:
+        """The same in 3-D, whatever the space."""
+        if frame in ("", "base", self._base):
+            return SPATIAL.identity
+        return self._given.get(frame) or self._search(frame)
 
     def _search(self, frame: str) -> Pose | None:
         """Through the nearest common ancestor of the frame and the base."""

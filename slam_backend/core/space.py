@@ -63,6 +63,10 @@ class Space(Protocol):
 
     def diagonal(self, variance_rotation: float, variance_translation: float) -> Array: ...
 
+    def flat(self, covariance: Array, variance_rotation: float, variance_translation: float) -> Array:
+        """With these variances, and no correlations, on the axes that a plane lacks."""
+        ...
+
     def size(self, pose: Pose) -> tuple[float, float]:
         """Length of the translation (m) and angle of the rotation (rad)."""
         ...
@@ -166,6 +170,9 @@ class Planar:
 
     def diagonal(self, variance_rotation: float, variance_translation: float) -> Array:
         return np.diag((variance_translation, variance_translation, variance_rotation))
+
+    def flat(self, covariance: Array, variance_rotation: float, variance_translation: float) -> Array:  # noqa: ARG002
+        return covariance
 
     def size(self, pose: Pose) -> tuple[float, float]:
         return sqrt(pose.x() ** 2 + pose.y() ** 2), abs(pose.theta())
@@ -276,6 +283,12 @@ class Spatial:
 
     def diagonal(self, variance_rotation: float, variance_translation: float) -> Array:
         return np.diag((variance_rotation,) * 3 + (variance_translation,) * 3)
+
+    def flat(self, covariance: Array, variance_rotation: float, variance_translation: float) -> Array:
+        flat = np.diag((variance_rotation, variance_rotation, 0, 0, 0, variance_translation))
+        axes = np.ix_((2, 3, 4), (2, 3, 4))  # yaw x y in GTSAM's order of six
+        flat[axes] = covariance[axes]
+        return flat
 
     def size(self, pose: Pose) -> tuple[float, float]:
         x, y, z = pose.translation()

@@ -23,7 +23,7 @@ def pose_graph(result: Result) -> PoseGraph:
     states = np.array([_state(space, space.pose_in(result.values, keyframes[n].pose)) for n in order])
     by_kind: dict[str, list[Factor]] = {"edges": [], "sightings": [], "priors": []}
     for factor in result.factors:
-        if factor.kind in ("motion", "loop"):
+        if factor.kind in ("motion", "odometry", "loop"):
             by_kind["edges"].append(factor)
         elif factor.kind == "pose":
             by_kind["priors"].append(factor)

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..core.backend import Update
+from ..core.check import pace_of
 from ..core.config import Config, OdometrySource
 from ..core.graph import Motion
 from ..core.keyframes import growth
@@ -41,6 +42,8 @@ class Odometer:
         self._covariance: tuple[Update, int, Array] | None = None
         driving = config.sources.get(config.driver) if config.driver else None
         self._noise = driving if isinstance(driving, OdometrySource) else OdometrySource()
+        self._pace = pace_of(config.driver or "", config)
+        self._good: OdometryPose | None = None  # the newest that follows what the worker believes
 
     def goes_on(self, stamp: int) -> bool:
         """Whether this stamp (ns) is newer than all that were told so."""
@@ -57,13 +60,31 @@ class Odometer:
     def locate(
         self, odometry: OdometryPose, update: Update | None, covariance: Sequence[float] | None
     ) -> Located | None:
-        """None before the first update."""
-        if update is None:
+        """None before the first update, and where the odometry jumps, until the worker has found out what that was."""
+        if update is None or not self._follows(odometry, update):
             return None
-        seven = composed(update.correction, odometry.pose.tolist())
-        return Located(seven, self._spread(odometry, update, covariance), update.correction)
+        correction = composed(update.correction, update.origin)
+        seven = composed(correction, odometry.pose.tolist())
+        return Located(seven, self._spread(odometry, seven, update, covariance), correction)
 
-    def _spread(self, odometry: OdometryPose, update: Update, covariance: Sequence[float] | None) -> Array:
+    def _follows(self, odometry: OdometryPose, update: Update) -> bool:
+        last = self._good
+        follows = (
+            last is None
+            or self._pace.breach(last, odometry) is None
+            or update.keyframe.stamp > last.stamp  # a restart begins with a keyframe
+        )
+        if follows:
+            self._good = odometry
+        return follows
+
+    def _spread(
+        self,
+        odometry: OdometryPose,
+        seven: Sequence[float],
+        update: Update,
+        covariance: Sequence[float] | None,
+    ) -> Array:
         """The keyframe's marginal, and the odometry's noise since, seen from here."""
         if covariance is None:
             return UNKNOWN
@@ -74,7 +95,7 @@ class Odometer:
         there = space.pose(update.pose)
         marginal = np.reshape(covariance, (6, 6))
         at_keyframe = Motion(there, space.covariance(marginal, there))
-        here = space.pose(composed(update.correction, odometry.pose.tolist()))
+        here = space.pose(seven)
         since = there.between(here)
         total = at_keyframe.then(Motion(since, growth(space, self._noise, since)))
         ros = space.covariance_to_ros(total.covariance, here).reshape(36)

@@ -543,11 +543,6 @@ def test_a_source_that_nobody_configured_is_said_with_those_that_are():
         Backend(config()).add(odometry(1, corner(0), "weels"))
 
 
-def test_two_odometry_sources_are_refused():
-    with pytest.raises(BadConfig, match="source 'visual': a second odometry; 'wheels' drives"):
-        Backend(config(visual={"kind": "odometry"}))
-
-
 def test_before_the_first_keyframe_there_is_no_estimate():
     backend = Backend(config())
     assert len(backend.snapshot().stamps) == 0

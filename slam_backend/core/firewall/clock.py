@@ -38,7 +38,8 @@ class Clock:
             return self._went_back(item, leap)
         self._behind, self._set_back = None, False
         # One that is older moves nothing: what it says is judged in its turn.
-        if leap <= 0 or (leap <= self._reach() and self._pace.breach(last, item) is None):
+        doubt = self._doubts[-1] if self._doubts and not self._leaps(self._doubts[0]) else None
+        if leap <= 0 or (leap <= self._reach() and self._pace.follows(last, doubt, item)):
             refused = self._refuse_doubts() if self._doubts else ()
             return (*refused, self._believe(item))
         return self._doubted(item)

@@ -19,6 +19,8 @@ QUATERNION_TOLERANCE = 0.1  # of the squared norm; less is normalized
 ABSURD_VARIANCE = 1e12  # m^2 or rad^2 on every used axis: a way to say "unknown"; no factor can come of it
 TINY_VARIANCE = 1e-18  # m^2 or rad^2: a sigma of a nanometre; what an integer in a float64 field looks like
 ASYMMETRY = 1e-6  # relative to the largest entry
+ACCELERATION = 20.0  # m/s^2 by which a speed that an odometry states may be outdone
+AWAY = 0.5  # m from its origin: from there no odometry comes back to exactly that in one step
 JITTER = 1.0  # m that a step may jump besides max_speed: odometry arrives in bursts
 JUMP = 1.0  # s that stamps of the driving source may leap ahead before the next message is asked
 WITNESSES = 3  # messages in a row, each following the other, that make a leap believed
@@ -96,11 +98,13 @@ RULES: Mapping[str, Rule] = {
     ),
     "check/range": Rule("warn", "the landmark is where the sensor is, or behind it", "drop returns without an echo", 0.0, "m"),
     "recheck/teleport": Rule(
-        "warn", "a lone jump, faster than max_speed allows", "raise max_speed of the source if the robot is that fast",
+        "warn", "a lone jump, faster than max_speed or its own twist allows",
+        "raise max_speed of the source if the robot is that fast; see that its twist is in m/s",
         _DEFAULTS[0].max_speed, "m/s", "<odometry>.max_speed",
     ),
+    "recheck/origin": Rule("warn", "a lone pose of exactly zero", "does the driver publish before it knows?", AWAY, "m"),
     "recheck/restart": Rule(
-        "warn", "the odometry jumped and stayed there: its frame moved, the robot did not",
+        "warn", "the odometry jumped and stayed there: a new epoch; across the jump it measures nothing",
         "find out why the odometry was reset", _DEFAULTS[0].max_speed, "m/s", "<odometry>.max_speed",
     ),
     # -- covariances: only the block that the space uses ---------------------------------------------------------

@@ -10,13 +10,19 @@ from ..context import Context
 from ..graph import Delta, Factor, Keyframe, Offer
 from ..measurement import Array, Decoder, Measurement, Message, format_stamp, frozen, seven_of, stamp_of
 from ..robust.kernels import noise_of
+from ..space import Space
 
+HERE: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
 UNKNOWN = frozen(np.zeros(36))  # a covariance of zeros means: use the configured default
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class OdometryPose(Measurement):
-    """`frame_T_child` with what the message says of its noise, all in ROS order."""
+    """`frame_T_child` with what the message says of its noise, all in ROS order.
+
+    epoch: how often the odometry has restarted; nothing measured the motion from one to the next. origin: the frame as the
+    messages of this epoch have it, in that of the first; the pose is in that of the first.
+    """
 
     frame: str
     child: str
@@ -24,6 +30,8 @@ class OdometryPose(Measurement):
     covariance: Array  # (36,) of the pose
     twist: Array  # (6,) m/s and rad/s in the child frame
     twist_covariance: Array  # (36,)
+    epoch: int = 0
+    origin: tuple[float, ...] = HERE
 
 
 STILL = frozen(np.zeros(6))
@@ -84,6 +92,15 @@ DECODERS: Mapping[str, Decoder] = {
     "geometry_msgs/msg/PoseStamped": decode_pose,
     TRANSFORMS: decode_transforms,
 }
+
+
+def stated(space: Space, config: OdometrySource, item: OdometryPose, seconds: float) -> Array | None:
+    """What `noise` needs of a message, at the tangent of its child: of its pose, of the step over these seconds, or nothing."""
+    if config.noise == "pose":
+        return space.covariance(item.covariance, space.pose(item.pose.tolist()))
+    if config.noise == "twist":
+        return space.twist_covariance(item.twist_covariance) * seconds**2
+    return None
 
 
 def factors(

@@ -6,7 +6,8 @@ from ...core.graph import keyframe
 from .page import Section, drawn, figure, numbers, script_data
 from .subject import Subject
 
-KINDS = {"motion": "#8a94a6", "loop": "#3c9a5f", "landmark": "#d9822b", "pose": "#8e6bbf"}
+KINDS = {"motion": "#8a94a6", "loop": "#3c9a5f", "landmark": "#d9822b", "pose": "#8e6bbf",
+         "odometry": "#2a9d9d", "floor": "#b5a642"}  # fmt: skip
 LOOP = list(KINDS).index("loop")
 MOST = 60_000  # factors
 BODY = """
