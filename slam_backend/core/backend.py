@@ -344,6 +344,7 @@ class Backend:
             self.track.motion,
             self.landmark,
             self.parts.of,
+            self._waiting.for_variable,
         )
 
     def landmark(self, name: str) -> int:
@@ -387,6 +388,7 @@ class Backend:
         delta += Delta(tuple(priors(self.config.floor, new)))
         self._decisions += delta.decisions
         self._decisions += [told for each in delta.waits for told in self._waiting.wait(each)]
+        window = [*window, *self._waiting.landed(delta.values, {factor.id for factor in delta.add})]
         judged = tuple(f for f in delta.add if any(f.kind in stage.kinds for stage in self._robust))
         sure = without(delta, {factor.id for factor in judged})
         try:

@@ -305,6 +305,13 @@ class LandmarkSource(Observing):
     """Observations of landmarks with known ids."""
 
     kind: Literal["landmark"] = "landmark"
+    frame: str = Field(
+        "",
+        description="frame of the sensor, for messages that do not name it (sensor_msgs/Range); empty: the base",
+    )
+    range_scale: float = Field(
+        1.0, gt=0.1, lt=10, description="how many times too long its ranges are; they are divided by it"
+    )
     sigma_position: float = Field(
         0.1, gt=0, le=1e6, description="m, for positions without noise of their own"
     )

@@ -1,6 +1,6 @@
 """What a sensor may know of the rest when it makes its factors."""
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -21,6 +21,7 @@ class Context:
     place: stamp -> nearest keyframe and the motion to the stamp; None where no odometry covers it.
     motion: (start, end) -> `start_T_end` by the driving source.
     landmark: name -> key. component: key -> number of its connected component (None: not in the graph).
+    waiting: key -> the measurements that wait for that variable.
     """
 
     space: Space
@@ -31,6 +32,7 @@ class Context:
     motion: Callable[[int, int], Motion]
     landmark: Callable[[str], int]
     component: Callable[[int], int | None]
+    waiting: Callable[[int], Sequence[Wait]] = lambda _: ()
 
     def pose(self, key: int) -> Pose:
         guess = self.guesses.get(key)

@@ -97,6 +97,12 @@ class Space(Protocol):
 
     def observe_bearing(self, pose: int, point: int, value: Array, noise: Any) -> gtsam.NonlinearFactor: ...
 
+    def observe_range(
+        self, pose: int, point: int, value: float, noise: Any, sensor: Pose
+    ) -> gtsam.NonlinearFactor:
+        """Distance of a point from a sensor that sits at `pose_T_sensor`."""
+        ...
+
     def estimate(self, solver: Any, key: int) -> Pose: ...
 
     def estimate_point(self, solver: Any, key: int) -> Array: ...
@@ -188,6 +194,13 @@ class Planar:
 
     def observe_bearing(self, pose: int, point: int, value: Array, noise: Any) -> gtsam.NonlinearFactor:
         return gtsam.BearingFactor2D(pose, point, gtsam.Rot2(value[0]), noise)
+
+    def observe_range(
+        self, pose: int, point: int, value: float, noise: Any, sensor: Pose
+    ) -> gtsam.NonlinearFactor:
+        if sensor is self.identity:
+            return gtsam.RangeFactor2D(pose, point, value, noise)
+        return gtsam.RangeFactorWithTransform2D(pose, point, value, noise, sensor)
 
     def to_polar(self, value: Array, covariance: Array) -> tuple[Array, Array]:
         x, y = float(value[0]), float(value[1])
@@ -307,6 +320,13 @@ class Spatial:
 
     def observe_bearing(self, pose: int, point: int, value: Array, noise: Any) -> gtsam.NonlinearFactor:
         return gtsam.BearingFactor3D(pose, point, gtsam.Unit3(self.direction(value[0], value[1])), noise)
+
+    def observe_range(
+        self, pose: int, point: int, value: float, noise: Any, sensor: Pose
+    ) -> gtsam.NonlinearFactor:
+        if sensor is self.identity:
+            return gtsam.RangeFactor3D(pose, point, value, noise)
+        return gtsam.RangeFactorWithTransform3D(pose, point, value, noise, sensor)
 
     def to_polar(self, value: Array, covariance: Array) -> tuple[Array, Array]:
         """The covariance of the bearing is in the basis of the Unit3 that `observe` makes."""

@@ -101,6 +101,19 @@ class Waiting:
         """A variable exists now, or parts were joined: what waited for it is offered again."""
         self._pending += [wait.offer for wait in self._undetermined.pop(key, ())]
 
+    def for_variable(self, key: int) -> Sequence[Wait]:
+        """What waits for it."""
+        return self._undetermined.get(key, ())
+
+    def landed(self, keys: Iterable[int], ids: Collection[str]) -> list[Offer]:
+        """Of what waited for these variables, the measurements that make them: they wait no longer."""
+        taken = []
+        for key in keys:
+            if waits := self._undetermined.get(key):
+                taken += [wait.offer for wait in waits if wait.offer.id in ids]
+                self._undetermined[key] = [wait for wait in waits if wait.offer.id not in ids]
+        return taken
+
     def for_a_joint(self) -> list[Wait]:
         """What waits until two parts become one."""
         return self._undetermined.get(UNTIL_JOINED, [])

@@ -130,7 +130,8 @@ def _kind_of_cloud(message: Any) -> str | None:
         return None
     if "stamp_i_sec" in names:
         return "relative"
-    return "landmark" if "id" in names and ({"x", "y"} <= names or "azimuth" in names) else None
+    told = {"x", "y"} <= names or not names.isdisjoint({"azimuth", "range"})
+    return "landmark" if "id" in names and told else None
 
 
 def _planar(inputs: BagInputs, kinds: dict[str, str]) -> bool:

@@ -49,8 +49,12 @@ def lifted(covariances: Array) -> Array:
 
 def rows(name: str) -> list[list[str]]:
     """The words of each line that has any. BadFile if this gtsam comes without the file."""
+    return [line.split() for line in example(name).read_text().splitlines() if line.strip()]
+
+
+def example(name: str) -> Path:
+    """BadFile if this gtsam comes without the file."""
     try:
-        path = Path(gtsam.findExampleDataFile(name))  # type: ignore[no-untyped-call]  # gtsam leaves it untyped
+        return Path(gtsam.findExampleDataFile(name))  # type: ignore[no-untyped-call]  # gtsam leaves it untyped
     except (FileNotFoundError, RuntimeError):
         raise BadFile(f"{name}: not among gtsam's examples; install the wheel of gtsam 4.3") from None
-    return [line.split() for line in path.read_text().splitlines() if line.strip()]

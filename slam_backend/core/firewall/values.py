@@ -39,7 +39,7 @@ def judge_sighting(item: LandmarkObservation, space: Space) -> tuple[int, ...]:
     keep = tuple(k for k in range(len(item.covariance)) if space.name == "3d" or k != vertical(item.form))
     if not all(isfinite(v) and abs(v) < FARTHEST for v in item.value[list(keep)].tolist()):
         raise Fault("not_finite")
-    if item.form == "bearing_range" and item.value[-1] <= 0:
+    if item.form in ("bearing_range", "range") and item.value[-1] <= 0:
         raise Fault("range", float(item.value[-1]))
     if item.form == "position" and not np.any(item.value[: space.point_dimension]):
         raise Fault("range", 0.0)

@@ -1,7 +1,9 @@
-"""Landmarks with known ids, seen from the robot: position, bearing and range, bearing alone."""
+"""Landmarks with known ids, seen from the robot: position, bearing and range, or one of these alone."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections import defaultdict
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from math import isnan
 from typing import Any, Literal, get_args
 
 import numpy as np
@@ -15,10 +17,13 @@ from ..keyframes import Placed
 from ..measurement import Array, Decoder, Measurement, Message, frozen, parse_frame, stamp_of
 from ..robust.kernels import noise_of
 from ..space import Space
+from .placing import is_due, place
+from .ranging import PLACELESS, range_factor, sighting, told
 
-Form = Literal["position", "bearing_range", "bearing"]
+Form = Literal["position", "bearing_range", "bearing", "range"]
 FORMS = frozenset(get_args(Form))
 
+UNNAMED = "?"  # the frame of a sensor that its messages do not tell
 COUNTABLE = 2.0**53  # of double precision
 NEAREST = 1e-6  # m; nearer, a landmark has no direction
 
@@ -31,6 +36,7 @@ class LandmarkObservation(Measurement):
     position  x y z (m)                       3x3
     bearing_range  azimuth elevation range    3x3
     bearing   azimuth elevation (rad)         2x2
+    range     range (m)                       1x1
     landmark: its name; empty where the message has none that can be.
     NaN on the diagonal of the covariance means: use the configured default. In 2-D z and elevation are not used.
     """
@@ -44,7 +50,7 @@ class LandmarkObservation(Measurement):
 
 def decode_points(message: Message, source: str) -> Iterable[LandmarkObservation]:
     """sensor_msgs/msg/PointCloud2: one observation per point; the fields `id` and `x y [z]`,
-    `range azimuth [elevation]` or `azimuth [elevation]`; noise by `cov` or `sigma_*`.
+    `range azimuth [elevation]`, `azimuth [elevation]` or `range`; noise by `cov` or `sigma_*`.
     """
     from .cloud import columns, scalars
 
@@ -62,8 +68,10 @@ def decode_points(message: Message, source: str) -> Iterable[LandmarkObservation
         form, axes = "bearing_range", ("azimuth", "elevation", "range")
     elif "azimuth" in table:
         form, axes = "bearing", ("azimuth", "elevation")
+    elif "range" in table:
+        form, axes = "range", ("range",)
     else:
-        raise BadMessage("point cloud of landmarks has neither 'x' and 'y' nor 'azimuth'")
+        raise BadMessage("point cloud of landmarks has neither 'x' and 'y' nor 'azimuth' nor 'range'")
     values = scalars({"z": zero, "elevation": zero, **table}, ("id", *axes))[:, 1:]
     for n, name in enumerate(_names(table["id"])):
         yield LandmarkObservation(
@@ -99,7 +107,23 @@ def _covariance(table: dict[str, Array], n: int, axes: tuple[str, ...]) -> Array
     return np.diag(sigmas**2)
 
 
-DECODERS: Mapping[str, Decoder] = {"sensor_msgs/msg/PointCloud2": decode_points}
+def decode_range(message: Message, source: str) -> Iterable[LandmarkObservation]:
+    """sensor_msgs/msg/Range: one range to the beacon that `header.frame_id` names; nothing where no echo came back."""
+    distance = float(message.range)
+    if (
+        isnan(distance) or message.min_range <= distance <= message.max_range
+    ):  # NaN is for the firewall to tell
+        beacon, _ = parse_frame(message.header.frame_id)
+        variance = float(getattr(message, "variance", 0.0)) or np.nan  # before Jazzy it had no such field
+        yield LandmarkObservation(
+            stamp_of(message), source, UNNAMED, beacon, "range", frozen([distance]), frozen([[variance]])
+        )
+
+
+DECODERS: Mapping[str, Decoder] = {
+    "sensor_msgs/msg/PointCloud2": decode_points,
+    "sensor_msgs/msg/Range": decode_range,
+}
 
 
 def factors(
@@ -115,27 +139,79 @@ def factors(
     range with its covariance to first order, which is exact enough while sigma is small beside the range.
     """
     points: dict[int, Array] = {}
-    delta = each(window, "landmark", lambda offer: _sight(offer, context, config, points))
-    return replace(delta, values=points)
+
+    def sight(offer: Offer) -> Factor | Wait:
+        return _sight(offer, context, config, points)
+
+    delta = each(window, "landmark", sight)
+    by_key: dict[int, list[Wait]] = defaultdict(list)
+    for wait in delta.waits:
+        if wait.until != UNTIL_JOINED:
+            by_key[wait.until].append(wait)
+    for key, new in by_key.items():
+        old = [
+            w for w in context.waiting(key) if w.offer.measurement.source == new[0].offer.measurement.source
+        ]
+        if is_due(len(old), len(old) + len(new), context.space.point_dimension):
+            delta += _placed(key, [*old, *new], context, config, points, sight)
+    made = {factor.id for factor in delta.add}
+    waits = tuple(wait for wait in delta.waits if wait.offer.id not in made)
+    return replace(delta, waits=waits, values=points)
+
+
+def _placed(
+    key: int,
+    waits: Sequence[Wait],
+    context: Context,
+    config: LandmarkSource,
+    points: dict[int, Array],
+    sight: Callable[[Offer], Factor | Wait],
+) -> Delta:
+    """The factors of all that waited for a landmark, if that fixes where it is; else a decision that says why not."""
+    newest = waits[-1].offer
+    part = context.component(context.landing(newest.measurement.stamp).keyframe.pose)
+    offers, sightings = [], []
+    for wait in waits:
+        m = wait.offer.measurement
+        assert isinstance(m, LandmarkObservation)
+        placed = context.landing(m.stamp)
+        if context.component(placed.keyframe.pose) == part:
+            seen = _in_space(m, context.space, config)
+            sightings.append(sighting(m.form, seen, placed, _mount(m, context, config), context))
+            offers.append(wait.offer)
+    found = place(sightings)
+    assert isinstance(newest.measurement, LandmarkObservation)
+    decision = told(newest, newest.measurement.landmark, found, len(sightings))
+    if found.point is None:
+        return Delta(decisions=(decision,))
+    points[key] = found.point
+    return each(offers, "landmark", sight) + Delta(decisions=(decision,))
+
+
+def _mount(m: LandmarkObservation, context: Context, config: LandmarkSource) -> Pose:
+    return context.mount(config.frame if m.frame == UNNAMED else m.frame)
 
 
 def _sight(offer: Offer, context: Context, config: LandmarkSource, points: dict[int, Array]) -> Factor | Wait:
     """One sighting; a landmark that it makes is added to `points`."""
     m = offer.measurement
     assert isinstance(m, LandmarkObservation)
-    placed, mount = context.landing(m.stamp), context.mount(m.frame)
+    placed, mount = context.landing(m.stamp), _mount(m, context, config)
     key, pose_key, space = context.landmark(m.landmark), placed.keyframe.pose, context.space
     known = key in points or context.component(key) is not None
     value, covariance = _in_space(m, space, config)
     if key not in points and known and context.component(key) != context.component(pose_key):
         why, seen = "the landmark belongs to a part of the graph that is not connected yet", None
-        if m.form != "bearing":
+        if m.form not in PLACELESS:
             _, _, point = _polar(m.form, (value, covariance), mount, placed.motion, space)
             seen = Seen(pose_key, key, point)
         return Wait(offer, UNTIL_JOINED, why, seen)
+    if m.form in PLACELESS and not known:
+        return Wait(offer, key, f"one {m.form} alone cannot place a landmark")
+    if m.form == "range":
+        point = points[key] if key in points else context.point(key)
+        return range_factor(offer, placed, mount, (value, covariance), key, point, context, config)
     if m.form == "bearing":
-        if not known:
-            return Wait(offer, key, "a bearing alone cannot place a landmark")
         return _bearing(offer, placed, mount, (value, covariance), context, config, points)
     value, noise, point = _polar(m.form, (value, covariance), mount, placed.motion, space)
     if not known:
@@ -210,12 +286,18 @@ def _in_space(m: LandmarkObservation, space: Space, config: LandmarkSource) -> t
         "position": (config.sigma_position**2,) * 3,
         "bearing_range": (bearing, bearing, span),
         "bearing": (bearing, bearing),
+        "range": (span,),
     }[m.form]
     keep = [k for k in range(len(m.value)) if space.name == "3d" or k != vertical(m.form)]
     covariance = defaulted(m.covariance[np.ix_(keep, keep)], np.diag([defaults[k] for k in keep]))
-    return m.value[keep], covariance
+    value = m.value[keep]
+    if config.range_scale != 1 and m.form in ("range", "bearing_range"):
+        value[-1] /= config.range_scale
+        covariance[-1] /= config.range_scale
+        covariance[:, -1] /= config.range_scale
+    return value, covariance
 
 
-def vertical(form: Form) -> int:
+def vertical(form: Form) -> int | None:
     """The axis of a value that a plane does not have."""
-    return 2 if form == "position" else 1
+    return {"position": 2, "range": None}.get(form, 1)

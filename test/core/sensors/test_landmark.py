@@ -9,14 +9,15 @@ import pytest
 
 from slam_backend.core.config import LandmarkSource
 from slam_backend.core.errors import BadMessage
-from slam_backend.core.graph import UNTIL_JOINED
+from slam_backend.core.graph import UNTIL_JOINED, Wait
 from slam_backend.core.measurement import SECOND, frozen
-from slam_backend.core.sensors.landmark import LandmarkObservation, decode_points, factors
+from slam_backend.core.sensors.landmark import LandmarkObservation, decode_points, decode_range, factors
 
+KEYFRAMES = (2, 6, 11)  # s
 AT_KEYFRAME, AFTER, BEFORE = 6 * SECOND, 7 * SECOND + SECOND // 3, 5 * SECOND - SECOND // 7
 STAMPS = pytest.mark.parametrize("stamp", [AT_KEYFRAME, AFTER, BEFORE], ids=["at", "after", "before"])
 FRAMES = pytest.mark.parametrize("frame", ["", "mast"], ids=["base", "mast"])
-FORMS = pytest.mark.parametrize("form", ["position", "bearing_range", "bearing"])
+FORMS = pytest.mark.parametrize("form", ["position", "bearing_range", "bearing", "range"])
 
 
 def form_of(point, form) -> np.ndarray:
@@ -31,17 +32,23 @@ def form_of(point, form) -> np.ndarray:
         "position": np.array([x, y, z]),
         "bearing_range": np.array([azimuth, elevation, distance]),
         "bearing": np.array([azimuth, elevation]),
+        "range": np.array([distance]),
     }[form]
 
 
-SIGMAS = {"position": [0.01, 0.03, 0.02], "bearing_range": [0.004, 0.001, 0.02], "bearing": [0.004, 0.001]}
+SIGMAS = {
+    "position": [0.01, 0.03, 0.02],
+    "bearing_range": [0.004, 0.001, 0.02],
+    "bearing": [0.004, 0.001],
+    "range": [0.02],
+}
 UNUSED = {"position": 2, "bearing_range": 1, "bearing": 1}
 
 
 def noise_of_form(rng, world, form, spread) -> np.ndarray:
     """A full covariance; in the plane, nonsense on the axis that it lacks."""
     covariance = spread(rng, SIGMAS[form])
-    if world.space.name == "2d":
+    if world.space.name == "2d" and form in UNUSED:
         k = UNUSED[form]
         covariance[k, :] = covariance[:, k] = np.nan
     return covariance
@@ -131,6 +138,41 @@ def test_a_bearing_alone_waits_until_its_landmark_has_a_position(world, offered)
     assert not delta.waits
 
 
+def test_ranges_that_are_too_long_are_divided_by_their_scale(world, offered):
+    true = sighting(world, "range", "", AT_KEYFRAME, np.array([[0.01]]))
+    long = replace(true, value=frozen(true.value * 1.1), covariance=frozen(true.covariance * 1.1**2))
+    (plain,) = factors(offered(true), None, None, world.context(), LandmarkSource()).add
+    (scaled,) = factors(offered(long), None, None, world.context(), LandmarkSource(range_scale=1.1)).add
+    assert scaled.factor.measured() == pytest.approx(plain.factor.measured())
+    np.testing.assert_allclose(scaled.factor.noiseModel().R(), plain.factor.noiseModel().R())
+
+
+def test_a_range_to_a_beacon_from_a_mast_is_the_native_factor_with_the_mast(world, offered):
+    seen = sighting(world, "range", "mast", AT_KEYFRAME, np.array([[0.01]]))
+    (made,) = factors(offered(seen), None, None, world.context(), LandmarkSource()).add
+    native = {"2d": gtsam.RangeFactorWithTransform2D, "3d": gtsam.RangeFactorWithTransform3D}[
+        world.space.name
+    ]
+    noise = gtsam.noiseModel.Isotropic.Sigma(1, 0.1)
+    keys = world.timeline.keyframes[1].pose, world.key("oak")
+    assert made.factor.equals(native(*keys, seen.value[0], noise, world.mounts.get("mast")), 1e-9)
+
+
+@pytest.mark.parametrize("form", ["range", "bearing"])
+def test_what_waits_for_a_place_becomes_factors_together_with_the_sighting_that_decides(world, offered, form):
+    world.known.discard("oak")
+    stamps = [int(t) for t in np.linspace(KEYFRAMES[0], KEYFRAMES[-1], 15) * SECOND]
+    sigma = np.eye(len(SIGMAS[form])) * 1e-8
+    offers = offered(*(sighting(world, form, "mast", stamp, sigma) for stamp in stamps))
+    before = [Wait(offer, world.key("oak"), "") for offer in offers[:-1]]
+    context = replace(world.context(), waiting=lambda _: before)
+    delta = factors(offers[-1:], None, None, context, LandmarkSource())
+    assert {factor.id for factor in delta.add} == {offer.id for offer in offers}
+    np.testing.assert_allclose(delta.values[world.key("oak")], world.point("oak"), atol=1e-3)
+    assert [(d.verdict, d.stage, d.reason) for d in delta.decisions] == [("accepted", "placing", "placed")]
+    assert not delta.waits
+
+
 def test_a_landmark_of_another_part_waits_until_they_are_joined(world, offered):
     world.parts[world.key("oak")] = 7
     seen = sighting(world, "position", "", AT_KEYFRAME, np.full((3, 3), np.nan))
@@ -161,7 +203,12 @@ def test_noise_that_is_not_stated_is_the_configured_one(world, offered, form):
     config = LandmarkSource(sigma_position=0.3, sigma_range=0.2, sigma_bearing=0.1)
     size = len(SIGMAS[form])
     seen = sighting(world, form, "", AT_KEYFRAME, np.full((size, size), np.nan))
-    stated = {"position": [0.3] * 3, "bearing_range": [0.1, 0.1, 0.2], "bearing": [0.1, 0.1]}[form]
+    stated = {
+        "position": [0.3] * 3,
+        "bearing_range": [0.1, 0.1, 0.2],
+        "bearing": [0.1, 0.1],
+        "range": [0.2],
+    }[form]
     same = replace(seen, covariance=frozen(np.diag(np.square(stated))))
     made = factors(offered(seen, same), None, None, world.context(), config).add
     default, explicit = (each.factor.noiseModel().R() for each in made)
@@ -172,6 +219,43 @@ def test_the_kernel_of_the_source_is_around_the_noise(world, offered):
     seen = sighting(world, "position", "", AT_KEYFRAME, np.full((3, 3), np.nan))
     (made,) = factors(offered(seen), None, None, world.context(), LandmarkSource(kernel="cauchy")).add
     assert isinstance(made.factor.noiseModel(), gtsam.noiseModel.Robust)
+
+
+# -- ranges of sensor_msgs/Range ---------------------------------------------------------------------------------
+
+
+def range_message(distance, **fields) -> SimpleNamespace:
+    header = SimpleNamespace(stamp=SimpleNamespace(sec=3, nanosec=5), frame_id="beacon_7")
+    told = {"min_range": 0.3, "max_range": 80.0, "variance": 0.04, **fields}
+    return SimpleNamespace(header=header, range=distance, **told)
+
+
+def test_a_range_message_names_its_beacon_and_may_state_its_variance():
+    (seen,) = decode_range(range_message(12.5), "radio")
+    assert (seen.stamp, seen.source, seen.form, seen.landmark) == (
+        3 * SECOND + 5,
+        "radio",
+        "range",
+        "beacon_7",
+    )
+    assert (seen.value.tolist(), seen.covariance.tolist()) == ([12.5], [[0.04]])
+    (unstated,) = decode_range(range_message(12.5, variance=0.0), "radio")
+    assert np.isnan(unstated.covariance).all()
+
+
+def test_a_range_beyond_what_the_sensor_can_tell_is_no_echo_and_says_nothing():
+    assert not list(decode_range(range_message(0.1), "radio"))
+    assert not list(decode_range(range_message(81.0), "radio"))
+    assert not list(decode_range(range_message(np.inf), "radio"))
+
+
+def test_the_sensor_of_ranges_sits_in_the_frame_that_the_source_names(world, offered):
+    (seen,) = decode_range(range_message(5.0), "radio")
+    seen = replace(seen, stamp=AT_KEYFRAME, landmark="oak")
+    (made,) = factors(offered(seen), None, None, world.context(), LandmarkSource(frame="mast")).add
+    sensor = world.pose(made.keys[0]).compose(world.mounts.get("mast"))
+    distance = np.linalg.norm(sensor.transformTo(world.point("oak")))
+    assert made.factor.unwhitenedError(world.values()) == pytest.approx(distance - 5.0)
 
 
 # -- messages ----------------------------------------------------------------------------------------------------
@@ -241,7 +325,6 @@ def test_a_cloud_without_points_says_nothing():
     ("columns", "text"),
     [
         ({"x": [1], "y": [1]}, "'id'"),
-        ({"id": [1], "range": [2]}, "azimuth"),
         ({"id": [1], "x": [1]}, "azimuth"),
         ({"id": [1], "x": [1], "y": [1], "cov": [[1, 2]]}, "9 are needed"),
         ({"id": [1], "x": [[1, 2]], "y": [[1, 2]]}, "'x' holds 2 numbers"),
