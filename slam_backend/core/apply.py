@@ -180,6 +180,8 @@ class Applier:
                 self._parts.put(key, factor.keys[0])
                 self.sighted[key] = (factor.keys[0], self._from(factor.keys[0], delta, key))
                 self._wake(key)
+            if factor.kind == "datum" and (part := self._parts.of(factor.keys[0])) is not None:
+                self._parts.release(part)
             if factor.kind in ("loop", "pose"):
                 self.decisions.append(self._verdicts.get(factor.id) or _accepted(factor))
         self._booked(delta)

@@ -55,7 +55,7 @@ class _Builder:
     def __init__(self, space: Space, before: gtsam.Values) -> None:
         self._space, self._before = space, before
         self.values, self.parts = gtsam.Values(), Parts()
-        self._anchored: set[int] = set()  # parts that absolute poses hold
+        self._anchored: set[int] = set()  # parts that absolute poses or the earth hold
         for key in sorted(before.keys()):
             if is_pose(key):
                 self.parts.begin(key, "")
@@ -76,7 +76,7 @@ class _Builder:
                 if gone in self._anchored:
                     self._anchored.remove(gone)
                     self._anchored.add(kept)
-        if factor.kind == "pose":
+        if factor.kind in ("pose", "datum"):
             self._anchored.add(self._part(first))
 
     def align(self, factor: Factor) -> None:

@@ -20,6 +20,7 @@ from .edits import Wishes
 from .errors import BadConfig, SlamError, SolverFailure
 from .floor import priors
 from .graph import (
+    DATUM,
     Decision,
     Delta,
     Estimate,
@@ -39,6 +40,7 @@ from .reunion import Reunion, reunion
 from .robust import ROBUST, Robust
 from .robust.paths import Paths
 from .sensors import SENSORS
+from .sensors.gnss import Fix
 from .sensors.odometry import HERE, OdometryPose, stated
 from .sensors.relative import RelativePose
 from .sessions import SavedMap, Tracks, fits, joined
@@ -102,6 +104,7 @@ class Backend:
         self.tracks = Tracks(self.track)
         self.timeline = Timeline()
         self.parts = Parts()
+        self.origin = config.earth.origin  # of east, north, up: latitude, longitude, altitude
         self._mounts = Mounts(space, config.base_frame, config.extrinsics)
         self._beside = {
             name: Beside(name, source, space, self._mounts)
@@ -161,6 +164,8 @@ class Backend:
             return []
         if self._relative and isinstance(measurement, RelativePose) and measurement.source == self._driver:
             self._mounts.name_base(measurement.frame_j)
+        if self.origin is None and isinstance(measurement, Fix):
+            self.origin = tuple(measurement.place.tolist())
         updates = self.complete(measurement.stamp)
         self._decisions += self._waiting.offer(measurement)
         self._is_complete = False
@@ -324,15 +329,16 @@ class Backend:
         """Ask each sensor, in the order of the configuration, for the factors of its part of the window."""
         if not window:
             return Delta()
-        context = self._context(guesses)
         by_source: dict[str, list[Offer]] = defaultdict(list)
         for offer in window:
             by_source[offer.measurement.source].append(offer)
-        return total(
-            SENSORS[source.kind].factors(by_source[name], a, b, context, source)
-            for name, source in self.config.sources.items()
-            if name in by_source
-        )
+        deltas: list[Delta] = []
+        for name, source in self.config.sources.items():
+            if name in by_source:
+                context = self._context(guesses)
+                deltas.append(SENSORS[source.kind].factors(by_source[name], a, b, context, source))
+                guesses = {**guesses, **deltas[-1].values}  # what one has found is there for the next
+        return total(deltas)
 
     def _context(self, guesses: Mapping[int, Any]) -> Context:
         return Context(
@@ -345,7 +351,17 @@ class Backend:
             self.landmark,
             self.parts.of,
             self._waiting.for_variable,
+            self.config.earth,
+            self.origin,
+            self._gauge,
+            DATUM in self.solver.factors,
         )
+
+    def _gauge(self, key: int) -> str | None:
+        """What holds the part of a variable, where the earth may take its place: nothing else will say where the map lies."""
+        part = self.parts.of(key)
+        others = any(source.kind == "pose" for source in self.config.sources.values())
+        return None if others or part is None or not self.parts.is_loose(part) else self.parts.gauge(part)
 
     def landmark(self, name: str) -> int:
         """The key of a landmark by its name; a new name gets a new key."""

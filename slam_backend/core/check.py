@@ -23,9 +23,10 @@ from .firewall.covariances import (
 )
 from .firewall.repeats import Repeats
 from .firewall.rules import Fault, decided
-from .firewall.values import judge_pose, judge_sighting, judge_stamps
+from .firewall.values import judge_fix, judge_pose, judge_sighting, judge_stamps
 from .graph import Decision
 from .measurement import Measurement, StaticTransform
+from .sensors.gnss import Fix
 from .sensors.landmark import LandmarkObservation
 from .sensors.odometry import OdometryPose
 from .sensors.pose import AbsolutePose
@@ -119,6 +120,11 @@ def _landmark(item: LandmarkObservation, space: Space, source: Any) -> Notes:  #
     return judge_noise(item.covariance, judge_sighting(item, space))
 
 
+def _fix(item: Fix, space: Space, source: Any) -> Notes:  # noqa: ARG001
+    judge_stamps(item.stamp)
+    return judge_noise(item.covariance, judge_fix(item, space))
+
+
 def _capped(item: Any, source: Any) -> Any:
     """With the covariance that is read cut to size."""
     name = _NOISE[source.noise] if isinstance(item, OdometryPose) else "covariance"
@@ -132,5 +138,6 @@ JUDGES: Mapping[type, Callable[[Any, Space, Any], Notes]] = {
     RelativePose: _relative,
     AbsolutePose: _absolute,
     LandmarkObservation: _landmark,
+    Fix: _fix,
     StaticTransform: _static,
 }

@@ -14,7 +14,7 @@ from collections.abc import Mapping, Sequence
 from difflib import get_close_matches
 from typing import Annotated, Any, Literal, get_args
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 from pydantic.fields import FieldInfo
 
 from .errors import BadConfig
@@ -333,9 +333,68 @@ class PoseSource(Observing):
     )
 
 
+class GnssSource(Observing):
+    """Positions on the earth. The lever arm is the mounting of the message's frame (extrinsics)."""
+
+    kind: Literal["gnss"] = "gnss"
+    sigma_horizontal: float = Field(
+        2.5, gt=0, le=1e6, description="m east and north, where the message states no covariance"
+    )
+    sigma_vertical: float = Field(
+        5.0, gt=0, le=1e6, description="m up, where the message states no covariance"
+    )
+    sigma_floor: float = Field(
+        0.02, gt=0, le=1e6, description="m: no fix counts as more certain, whatever its message says"
+    )
+    probability: float = Field(
+        0.999,
+        gt=0,
+        lt=1,
+        description="with which a true fix passes, if all noise is as stated; others are doubted",
+    )
+    agreeing: int = Field(
+        5, ge=2, le=1000, description="doubted fixes in a row that must agree with each other to be believed"
+    )
+
+
 AnySource = Annotated[
-    OdometrySource | RelativeSource | LandmarkSource | PoseSource, Field(discriminator="kind")
+    OdometrySource | RelativeSource | LandmarkSource | PoseSource | GnssSource, Field(discriminator="kind")
 ]
+
+
+class Earth(Section):
+    """Where the map lies on the earth, for sources of kind gnss: estimated, from what is known beforehand."""
+
+    origin: tuple[float, float, float] | None = Field(
+        None,
+        description="latitude, longitude (degrees, WGS-84) and altitude (m) of the origin of east, north, up; none: the first fix",
+    )
+    yaw: float | None = Field(
+        None,
+        ge=-6.3,
+        le=6.3,
+        description="rad from east to the map's x axis, counter-clockwise; none: found from the path",
+    )
+    sigma_yaw: float = Field(0.05, gt=0, le=3.2, description="rad, of that yaw where it is given")
+    sigma_level: float = Field(
+        0.1, gt=0, le=3.2, description="rad by which the map's z may lean from the vertical (3d)"
+    )
+    baseline: float = Field(
+        5.0, gt=0, le=1e6, description="m that the fixes must reach over before a yaw is looked for"
+    )
+    yaw_within: float = Field(
+        0.2,
+        gt=0,
+        le=1.5,
+        description="rad to which two fixes that far apart must tell the yaw before it is looked for",
+    )
+
+    @field_validator("origin")
+    @classmethod
+    def _on_earth(cls, origin: tuple[float, float, float] | None) -> tuple[float, float, float] | None:
+        if origin is not None and not (abs(origin[0]) < 90 and abs(origin[1]) <= 180):
+            raise ValueError("latitude lies within 90 degrees, longitude within 180")
+        return origin
 
 
 class Config(Section):
@@ -372,6 +431,7 @@ class Config(Section):
     journal: Journaling = Journaling()
     floor: Floor = Floor()
     path: PathOutput = PathOutput()
+    earth: Earth = Earth()
     extrinsics: Mapping[str, tuple[float, float, float, float, float, float]] = Field(
         default_factory=dict,
         description="frame: x, y, z (m), roll, pitch, yaw (rad) of that sensor in the base",
@@ -385,7 +445,7 @@ class Config(Section):
         for name in self.sources:
             if not name or "/" in name or "@" in name:
                 raise ValueError(f"source name '{name}' must not be empty or contain '/' or '@'")
-            if name in Config.model_fields or name in ("gauge", "command", "floor"):
+            if name in Config.model_fields or name in ("gauge", "datum", "command", "floor"):
                 raise ValueError(f"a source cannot be called '{name}': that name has a meaning of its own")
         if len(set(self.robust)) < len(self.robust):
             raise ValueError(f"'robust' names '{max(self.robust, key=self.robust.count)}' twice")
@@ -478,7 +538,7 @@ def _one_told(first: Any, names: Sequence[str]) -> str:
     if first["type"] == "union_tag_invalid":
         what = f"there is no kind of source {first['ctx']['tag']!r}; known: {first['ctx']['expected_tags']}"
     if first["type"] == "union_tag_not_found":
-        what = "is a source, and does not say its kind: add kind: odometry, relative, landmark or pose"
+        what = "is a source, and does not say its kind: add kind: odometry, relative, landmark, pose or gnss"
     if first["type"] == "extra_forbidden":
         what = f"there is no such setting{_suggest(first['loc'], names)}"
     value = first.get("input")
@@ -500,6 +560,7 @@ def _suggest(location: tuple[int | str, ...], names: Sequence[str]) -> str:
             "relative": RelativeSource,
             "landmark": LandmarkSource,
             "pose": PoseSource,
+            "gnss": GnssSource,
         }
         known = set(kinds[path[-1]].model_fields) if path[-1] in kinds else set(kinds)
     elif path:

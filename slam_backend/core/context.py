@@ -1,11 +1,12 @@
 """What a sensor may know of the rest when it makes its factors."""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
+from .config import Earth
 from .graph import Decision, Delta, Estimate, Factor, Motion, Offer, Pose, Wait
 from .keyframes import Placed
 from .measurement import Array
@@ -22,6 +23,9 @@ class Context:
     motion: (start, end) -> `start_T_end` by the driving source.
     landmark: name -> key. component: key -> number of its connected component (None: not in the graph).
     waiting: key -> the measurements that wait for that variable.
+    origin: latitude, longitude, altitude; None before the first fix.
+    gauge: key -> id of the factor that holds its component and may be replaced; None where something else holds it, or will.
+    has_datum: the earth stays where it is in the map.
     """
 
     space: Space
@@ -33,6 +37,19 @@ class Context:
     landmark: Callable[[str], int]
     component: Callable[[int], int | None]
     waiting: Callable[[int], Sequence[Wait]] = lambda _: ()
+    earth: Earth = field(default_factory=Earth)
+    origin: Sequence[float] | None = None
+    gauge: Callable[[int], str | None] = lambda _: None
+    has_datum: bool = False
+
+    def known(self, key: int) -> bool:
+        """Whether a variable is in the graph, or about to enter."""
+        return key in self.guesses or self.component(key) is not None
+
+    def apart(self, key: int, other: int) -> bool:
+        """Whether the two are in components that nothing connects yet."""
+        parts = self.component(key), self.component(other)
+        return None not in parts and parts[0] != parts[1]
 
     def pose(self, key: int) -> Pose:
         guess = self.guesses.get(key)

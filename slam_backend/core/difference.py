@@ -14,7 +14,7 @@ from .measurement import Array
 from .trajectory import Snapshot, Stamps
 
 EVERYDAY = frozenset(
-    {"motion", "odometry", "landmark", "floor", "gauge"}
+    {"motion", "odometry", "landmark", "gnss", "floor", "gauge"}
 )  # kinds of factors that are only counted
 STILL = 1e-6  # m or rad: less is rounding
 

@@ -26,6 +26,13 @@ def keyframe(index: int, stamp: int) -> Keyframe:
     return Keyframe(index, stamp, int(X(index)))
 
 
+EARTH = int(gtsam.symbol("e", 0))  # east, north, up at an origin, in the map: see sensors/gnss.py
+HOLDING = frozenset(
+    {"gauge", "datum"}
+)  # kinds of factors that only say where the map lies: no part of a cost
+DATUM = "datum/0.000000000/0"  # id of the factor that holds it, where that holds the map
+
+
 def landmark_key(index: int) -> int:
     return int(L(index))
 
@@ -47,7 +54,7 @@ class Factor:
     """A GTSAM factor and where it came from; the id is the same in every replay.
 
     id: `<source>/<stamp>/<n>`, n counting the measurements of that source with that stamp.
-    kind: motion (it made a keyframe), odometry (beside that), loop, landmark, pose, floor or gauge; what reports, robust stages and
+    kind: motion (it made a keyframe), odometry (beside that), loop, landmark, pose, floor, gnss, earth, datum or gauge; what reports, robust stages and
     exports sort by.
     stamp: of the measurement; stamps: of its two ends, for relative measurements.
     """

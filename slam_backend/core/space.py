@@ -25,6 +25,7 @@ class Space(Protocol):
     dimension: int  # of a pose's tangent
     used: tuple[int, ...]  # the axes of ROS's x y z roll pitch yaw that count
     point_dimension: int
+    translation: slice  # of a pose's tangent
     identity: Pose
     between: Any  # factor classes
     prior: Any
@@ -128,6 +129,7 @@ class Planar:
     dimension = 3
     used = (0, 1, 5)
     point_dimension = 2
+    translation = slice(0, 2)
     identity = gtsam.Pose2()
     between = gtsam.BetweenFactorPose2
     prior = gtsam.PriorFactorPose2
@@ -247,6 +249,7 @@ class Spatial:
     dimension = 6
     used = (0, 1, 2, 3, 4, 5)
     point_dimension = 3
+    translation = slice(3, 6)
     identity = gtsam.Pose3()
     between = gtsam.BetweenFactorPose3
     prior = gtsam.PriorFactorPose3

@@ -8,6 +8,7 @@ from ..core.config import Config, config_from
 from ..core.errors import BadConfig, BadMessage
 from ..core.measurement import Array, Measurement
 from ..core.sensors.cloud import columns
+from ..core.sensors.gnss import DECODERS as GNSS
 from ..core.sensors.odometry import DECODERS as ODOMETRY
 from ..core.sensors.odometry import TRANSFORMS, OdometryPose, decode_transforms
 from .bags import Bag
@@ -96,7 +97,7 @@ def _kinds_of(inputs: BagInputs) -> tuple[dict[str, str], list[str]]:
 
 def _first_messages(inputs: BagInputs) -> dict[str, tuple[Any, Bag]]:
     first: dict[str, tuple[Any, Bag]] = {}
-    types = {*ODOMETRY, "sensor_msgs/msg/PointCloud2"}
+    types = {*ODOMETRY, *GNSS, "sensor_msgs/msg/PointCloud2"}
     for bag in inputs.bags:
         for topic, what in bag.topics.items():
             if what.type in types and topic not in first and topic != TF_STATIC:
@@ -117,6 +118,8 @@ def kind_of(record: Record, typestore: Any) -> str | None:
         return None
     if record.type == "sensor_msgs/msg/PointCloud2":
         return _kind_of_cloud(message)
+    if record.type in GNSS:
+        return "gnss"
     if "@" in message.header.frame_id:
         return "relative"
     in_map = message.header.frame_id.lstrip("/") == "map"

@@ -20,7 +20,7 @@ from ..core.config import Config, config_from, config_hash, config_to
 from ..core.decisions import DecisionLog
 from ..core.errors import BadFile, SlamError
 from ..core.fingerprint import run_hash
-from ..core.graph import Decision, Factor
+from ..core.graph import HOLDING, Decision, Factor
 from ..core.measurement import SECOND, Measurement, StaticTransform, format_stamp
 from ..core.sessions import SavedMap
 from ..core.settle import FAR, settled
@@ -386,7 +386,7 @@ def cost(factors: Iterable[Factor], values: gtsam.Values) -> float:
     """chi2/2, gauges left out."""
     graph = gtsam.NonlinearFactorGraph()
     for factor in factors:
-        if factor.kind != "gauge":
+        if factor.kind not in HOLDING:
             graph.add(factor.factor)
     return float(graph.error(values))
 

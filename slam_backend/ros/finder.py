@@ -49,7 +49,7 @@ class Finder:
             return config
         config = self._with(topic, config)
         for other in self._kinds:
-            if other not in self.unused and self._kinds[other] in ("landmark", "pose"):
+            if other not in self.unused and self._kinds[other] in ("landmark", "pose", "gnss"):
                 config = self._with(other, config)
         return config
 
@@ -70,7 +70,7 @@ class Finder:
         kind = self._kinds[topic]
         if config.driver is not None and kind != "odometry":
             return True
-        if kind in ("landmark", "pose"):
+        if kind in ("landmark", "pose", "gnss"):
             return False
         return monotonic() - self._since[topic] >= PATIENCE.get((kind, self._types[topic]), LONGEST)
 

@@ -146,6 +146,11 @@ RULES: Mapping[str, Rule] = {
     "*/unknown_frame": Rule(
         "error", "nobody says where this frame is on the robot", "add it to 'extrinsics' or send it on /tf_static"
     ),
+    "check/no_fix": Rule("note", "the receiver says that it has no fix", "nothing; if it is often so, look at the antenna", 0.0),
+    "check/off_earth": Rule(
+        "error", "latitude or longitude is out of range, or both are zero",
+        "degrees, WGS-84; a receiver without a fix must say so in status", 90.0, "degrees",
+    ),
     "check/landmark_id": Rule("warn", "the id is no number", "give each landmark a whole number, the same at each sighting"),
     "check/landmark_kind": Rule(
         "error", "there is no landmark of this kind", "send position, bearing and range, or bearing: see docs/messages.md"

@@ -5,6 +5,7 @@ from math import isfinite
 import numpy as np
 
 from ..measurement import SECOND, Array
+from ..sensors.gnss import Fix
 from ..sensors.landmark import FORMS, LandmarkObservation, vertical
 from ..space import Space
 from .rules import FARTHEST, LATEST, QUATERNION_TOLERANCE, Fault
@@ -44,3 +45,17 @@ def judge_sighting(item: LandmarkObservation, space: Space) -> tuple[int, ...]:
     if item.form == "position" and not np.any(item.value[: space.point_dimension]):
         raise Fault("range", 0.0)
     return keep
+
+
+def judge_fix(item: Fix, space: Space) -> tuple[int, ...]:
+    """The axes of east, north, up that the space uses."""
+    if item.status < 0:
+        raise Fault("no_fix", float(item.status))
+    latitude, longitude, altitude = item.place.tolist()
+    if space.name == "2d":
+        altitude = 0.0
+    if not isfinite(latitude + longitude + altitude) or abs(altitude) > FARTHEST:
+        raise Fault("not_finite")
+    if abs(latitude) > 90 or abs(longitude) > 180 or latitude == longitude == 0:
+        raise Fault("off_earth", latitude)
+    return tuple(range(space.point_dimension))

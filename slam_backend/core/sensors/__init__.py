@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 from ..context import Context
 from ..graph import Delta, Keyframe, Offer
 from ..measurement import Decoder
-from . import landmark, odometry, pose, relative, static
+from . import gnss, landmark, odometry, pose, relative, static
 
 
 class Sensor(NamedTuple):
@@ -24,6 +24,7 @@ SENSORS: Mapping[str, Sensor] = {
     "odometry": Sensor(odometry.DECODERS, odometry.factors),
     "relative": Sensor(relative.DECODERS, relative.factors),
     "landmark": Sensor(landmark.DECODERS, landmark.factors),
+    "gnss": Sensor(gnss.DECODERS, gnss.factors),
     "pose": Sensor(pose.DECODERS, pose.factors),
     "static": Sensor(static.DECODERS, static.factors),
 }

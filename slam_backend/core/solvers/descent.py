@@ -14,7 +14,7 @@ import gtsam
 import numpy as np
 
 from ..errors import SolverFailure
-from ..graph import Factor
+from ..graph import HOLDING, Factor
 from .planar import Planar
 
 MethodName = Literal["lm", "gn", "dogleg"]
@@ -101,7 +101,7 @@ class Descent:
         self._graph, self._gauges = gtsam.NonlinearFactorGraph(), gtsam.NonlinearFactorGraph()
         for factor in self._factors:
             self._graph.add(factor.factor)
-            if factor.kind == "gauge":
+            if factor.kind in HOLDING:
                 self._gauges.add(factor.factor)
         self._options, self._progress = options, progress
         self.values = start

@@ -8,11 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import SolverFailure
-from ..graph import Factor, is_pose
+from ..graph import HOLDING, Factor, is_pose
 from ..space import SPACES, Space
 
 GAUGE_SIGMA = 1e-3  # m and rad; any value gives the same optimum, this one is no stranger among usual noise
-FIXING = frozenset({"gauge", "pose"})  # kinds of factors that hold a part in space
+FIXING = HOLDING | {"pose"}  # kinds of factors that hold a part in space
 
 Labels = NDArray[np.int64]
 

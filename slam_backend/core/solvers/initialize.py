@@ -16,7 +16,7 @@ import gtsam
 import numpy as np
 
 from ..errors import BadConfig, SolverFailure
-from ..graph import Factor, Pose, is_pose
+from ..graph import HOLDING, Factor, Pose, is_pose
 from ..measurement import Array
 from ..space import Space
 from .batch import Start
@@ -84,7 +84,7 @@ def cost_of(factors: Sequence[Factor], values: gtsam.Values) -> float:
     """chi2/2, gauges left out."""
     graph = gtsam.NonlinearFactorGraph()
     for factor in factors:
-        if factor.kind != "gauge":
+        if factor.kind not in HOLDING:
             graph.add(factor.factor)
     return float(graph.error(values))
 
@@ -187,7 +187,7 @@ INITIALIZATIONS: Mapping[str, Callable[[Ground], gtsam.Values]] = {
 def _anchored(poses: Mapping[int, Pose], ground: Ground) -> gtsam.Values:
     """Each island moved to what holds it in space, else to where the file states its first pose."""
     shift: dict[int, Pose] = {}
-    fixing = [factor for factor in ground.factors if factor.kind in FIXING]
+    fixing = [factor for factor in ground.factors if factor.kind in FIXING and is_pose(factor.keys[0])]
     for row, factor in zip(ground.found.rows([f.keys[0] for f in fixing]).tolist(), fixing, strict=True):
         if (island := int(ground.island[row])) not in shift:
             shift[island] = factor.factor.prior().compose(poses[row].inverse())

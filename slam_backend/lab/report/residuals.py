@@ -7,6 +7,7 @@ from .page import Section, dots, drawn, figure, said, table
 from .subject import Subject
 
 COLOURS = ("#1f4e9c", "#3c9a5f", "#d9822b", "#8e6bbf", "#c0392b", "#2a9d9d", "#555555")
+HELD = ("gauge", "datum", "earth")  # what only says where the map lies
 MOST = 4_000  # dots of one source
 LITTLE = 3.0  # degrees of freedom left over, below which nothing can be said
 
@@ -16,7 +17,7 @@ def section(run: Subject) -> Section:
     sources = np.array([each.partition("/")[0] for each in linear.ids.tolist()])
     left = linear.redundancy()
     rows, traces = [], []
-    named = [name for name in dict.fromkeys(sources.tolist()) if name != "gauge"]
+    named = [name for name in dict.fromkeys(sources.tolist()) if name not in HELD]
     for name, colour in zip(named, COLOURS * len(named), strict=False):
         here = np.flatnonzero(sources == name)
         rows.append(_row(name, linear.chi_squares[here], left[here]))
