@@ -20,6 +20,7 @@ BENCHES = (
     "query",
     "report",
     "robust",
+    "accuracy",
     "live",
     "journal",
     "crash",
