@@ -7,7 +7,14 @@ import sys
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
+import numpy as np
+import yaml
+
 from bench.table import Row, markdown
+from slam_backend.core.config import config_from
+from slam_backend.core.fixes import Compared
+from slam_backend.core.measurement import Array
+from slam_backend.io.replay import replay
 
 TITLE = "Accuracy on real data"
 EXPLANATION = (
@@ -16,7 +23,52 @@ EXPLANATION = (
 )
 SHARED = Path(__file__).parents[2] / "shared/data"
 
-SETS: Mapping[str, Callable[[], list[Row]]] = {}  # name -> rows; none where the data are not at hand
+HUSKY = """
+space: 2d
+sources: [wheels, gps]
+wheels: {kind: odometry, topic: /husky_velocity_controller/odom}
+gps: {kind: gnss, topic: /fix}
+extrinsics: {gps: [0, 0, 0, 0, 0, 0]}
+"""
+OUTAGES = ((80.0, 140.0), (180.0, 240.0), (300.0, 360.0))  # s
+
+
+def husky() -> list[Row]:
+    """A robot outdoors, its yaw unknown at the start: fixes kept back for a minute, horizontally; beside it, straight lines across."""
+    bag = SHARED / "bags/robot_localization/test1.bag"
+    if not bag.exists():
+        return []
+    made = []
+    for start, end in OUTAGES:
+        settings = (f"gps.withhold=[[{start}, {end}]]",)
+        result = replay(bag, config_from(yaml.safe_load(HUSKY)), settings).result
+        found = result.run.backend.compared(result.snapshot)
+        assert found is not None
+        ours, lines = (rms(each[found.withheld]) for each in (away(found), away_by_lines(found)))
+        what = f"Husky, no GNSS from {start:g} to {end:g} s"
+        made.append(Row(what, f"{ours:.2f} m", f"{lines:.2f} m interpolated", ours, "<= 4"))
+    return made
+
+
+def away(found: Compared) -> Array:
+    """(N,) m horizontally from each fix to where its antenna is believed to have been."""
+    return np.asarray(np.linalg.norm((found.antennas - found.fixes)[:, :2], axis=1))
+
+
+def away_by_lines(found: Compared) -> Array:
+    """(N,) the same of straight lines between the fixes that are not kept back."""
+    used = ~found.withheld
+    drawn = [np.interp(found.stamps, found.stamps[used], found.fixes[used, axis]) for axis in (0, 1)]
+    return np.asarray(np.hypot(drawn[0] - found.fixes[:, 0], drawn[1] - found.fixes[:, 1]))
+
+
+def rms(errors: Array) -> float:
+    return float(np.sqrt(np.mean(errors**2)))
+
+
+SETS: Mapping[str, Callable[[], list[Row]]] = {
+    "husky": husky
+}  # name -> rows; none where the data are not at hand
 
 
 def rows() -> list[Row]:

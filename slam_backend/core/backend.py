@@ -13,14 +13,17 @@ from .adopted import Adopted
 from .apply import Applier, touched, without
 from .beside import Beside
 from .command import Command
-from .config import Config, LandmarkSource, OdometrySource, PoseSource, RelativeSource
+from .config import Config, GnssSource, LandmarkSource, OdometrySource, PoseSource, RelativeSource
 from .context import Context
 from .editor import Editor, Shift
 from .edits import Wishes
 from .errors import BadConfig, SlamError, SolverFailure
+from .firewall.rules import decided
+from .fixes import Compared, Fixes
 from .floor import priors
 from .graph import (
     DATUM,
+    EARTH,
     Decision,
     Delta,
     Estimate,
@@ -33,7 +36,7 @@ from .graph import (
 )
 from .growth import Growth
 from .keyframes import Timeline, Track, due
-from .measurement import SECOND, Measurement, StaticTransform
+from .measurement import SECOND, Array, Measurement, StaticTransform
 from .mounts import Mounts
 from .parts import Parts
 from .reunion import Reunion, reunion
@@ -105,6 +108,7 @@ class Backend:
         self.timeline = Timeline()
         self.parts = Parts()
         self.origin = config.earth.origin  # of east, north, up: latitude, longitude, altitude
+        self.fixes = Fixes()
         self._mounts = Mounts(space, config.base_frame, config.extrinsics)
         self._beside = {
             name: Beside(name, source, space, self._mounts)
@@ -164,8 +168,9 @@ class Backend:
             return []
         if self._relative and isinstance(measurement, RelativePose) and measurement.source == self._driver:
             self._mounts.name_base(measurement.frame_j)
-        if self.origin is None and isinstance(measurement, Fix):
-            self.origin = tuple(measurement.place.tolist())
+        if isinstance(measurement, Fix) and not self._takes(measurement):
+            self._decisions.append(decided(measurement, "refused", "gnss/withheld"))
+            return []
         updates = self.complete(measurement.stamp)
         self._decisions += self._waiting.offer(measurement)
         self._is_complete = False
@@ -244,6 +249,18 @@ class Backend:
             points,
             self._revision,
         )
+
+    def earth(self) -> Array | None:
+        """(7,) `map_T_earth`: where the frame east, north, up at `origin` lies in the map; None before that is known."""
+        if self._applier.estimate is None or not self.estimate.knows(EARTH):
+            return None
+        return np.array(self.space.seven(self.estimate.pose(EARTH)))
+
+    def compared(self, snapshot: Snapshot) -> Compared | None:
+        """Every fix beside where its antenna is believed to have been; None without any."""
+        if self.origin is None or not len(self.fixes):
+            return None
+        return self.fixes.compared(snapshot, self.earth(), self.origin, self._mounts.whole)
 
     def dead_reckoning(self) -> gtsam.Values:
         """Where everything would be by odometry alone, landmarks where their first sighting puts them."""
@@ -356,6 +373,12 @@ class Backend:
             self._gauge,
             DATUM in self.solver.factors,
         )
+
+    def _takes(self, fix: Fix) -> bool:
+        """Book a fix; whether it is to be used."""
+        source = self.config.sources.get(fix.source)
+        self.origin = self.origin or tuple(fix.place.tolist())
+        return not isinstance(source, GnssSource) or self.fixes.add(fix, source)
 
     def _gauge(self, key: int) -> str | None:
         """What holds the part of a variable, where the earth may take its place: nothing else will say where the map lies."""

@@ -352,6 +352,12 @@ class GnssSource(Observing):
         lt=1,
         description="with which a true fix passes, if all noise is as stated; others are doubted",
     )
+    withhold: tuple[tuple[float, float], ...] = Field(
+        (), description="spans [from, to] in s after its first fix, whose fixes are kept back as a truth"
+    )
+    withhold_every: int | None = Field(
+        None, ge=2, description="every so many fixes one is kept back as a truth; none: all are used"
+    )
     agreeing: int = Field(
         5, ge=2, le=1000, description="doubted fixes in a row that must agree with each other to be believed"
     )

@@ -9,7 +9,7 @@ from .graph import Decision
 from .measurement import SECOND, format_stamp
 
 # stages that a flood of bad messages can fill
-ABOUT_RECORDS = frozenset({"decode", "check", "settle", "recheck", "landmark", "odometry", "pose", "session"})
+ABOUT_RECORDS = frozenset({"decode", "check", "settle", "recheck", "landmark", "odometry", "pose", "gnss", "session"})
 
 
 class DecisionLog:

@@ -24,6 +24,7 @@ STAGES = {
     "recheck": "Odometry, in order of stamps",
     "wait": "While waiting for a keyframe",
     "*": "Where it lands",
+    "gnss": "Fixes on the earth",
 }
 
 

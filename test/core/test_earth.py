@@ -128,3 +128,25 @@ def test_a_run_with_fixes_ends_in_the_same_bits_again(space):
         run(found, drive(space)[0])
         ends.append(found.snapshot().trajectory.sevens)
     np.testing.assert_array_equal(*ends)
+
+
+def test_fixes_that_are_kept_back_take_no_part_and_are_compared(space):
+    items, _ = drive(space)
+    found = backend(space, sources={"gps": {"kind": "gnss", "withhold": [[50, 70]], "withhold_every": 7}})
+    decisions = run(found, items)
+    compared = found.compared(found.snapshot())
+    seconds = compared.stamps // SECOND - 1
+    expected = ((seconds >= 50) & (seconds < 70)) | ((seconds + 1) % 7 == 0)
+    np.testing.assert_array_equal(compared.withheld, expected)
+    assert sum(d.reason == "withheld" for d in decisions) == expected.sum()
+    assert sum(f.kind == "gnss" for f in found.solver.factors.values()) == 120 - expected.sum()
+    away = np.linalg.norm((compared.antennas - compared.fixes)[:, :2], axis=1)
+    assert np.median(away[compared.withheld]) < 1.5
+
+
+def test_before_the_map_has_a_place_on_the_earth_nothing_is_compared_with_the_fixes(space):
+    found = backend(space)
+    run(found, drive(space, seconds=4)[0])
+    assert found.earth() is None
+    assert np.isnan(found.compared(found.snapshot()).antennas).all()
+    assert backend(space).compared(None) is None

@@ -147,6 +147,7 @@ RULES: Mapping[str, Rule] = {
         "error", "nobody says where this frame is on the robot", "add it to 'extrinsics' or send it on /tf_static"
     ),
     "check/no_fix": Rule("note", "the receiver says that it has no fix", "nothing; if it is often so, look at the antenna", 0.0),
+    "gnss/withheld": Rule("note", "kept back as a truth, as the configuration wants", "nothing; see withhold and withhold_every"),
     "check/off_earth": Rule(
         "error", "latitude or longitude is out of range, or both are zero",
         "degrees, WGS-84; a receiver without a fix must say so in status", 90.0, "degrees",

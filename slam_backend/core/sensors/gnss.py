@@ -90,9 +90,14 @@ def factors(
     return replace(delta, add=(*laid, *delta.add), remove=remove, values={EARTH: found})
 
 
-def enu(place: Array, origin: Sequence[float]) -> Array:
-    """(3,) m east, north and up of the origin; both in degrees and m."""
-    return np.array(pymap3d.geodetic2enu(*place, *origin))
+def enu(places: Array, origin: Sequence[float]) -> Array:
+    """(..., 3) m east, north and up of the origin; both in degrees and m."""
+    return np.stack(pymap3d.geodetic2enu(*np.moveaxis(places, -1, 0), *origin), axis=-1)
+
+
+def geodetic(points: Array, origin: Sequence[float]) -> Array:
+    """The inverse of `enu`."""
+    return np.stack(pymap3d.enu2geodetic(*np.moveaxis(points, -1, 0), *origin), axis=-1)
 
 
 def _factor(offer: Offer, context: Context, config: GnssSource) -> Factor | Wait:
