@@ -1,11 +1,12 @@
 """Whether a measured relative pose and a path between the same two poses say the same, and what it would take."""
 
 from dataclasses import dataclass, replace
-from typing import Any
+from math import hypot, inf, isfinite, sqrt
 
 import numpy as np
 
 from ..config import Gate
+from ..graph import Pose
 from ..measurement import Array
 from ..space import Space
 from .chi2 import chi2_quantile
@@ -58,13 +59,16 @@ class Ruler:
         """near: how long odometry is believed not to drift by more than `gate.drift`: while that is below so many metres."""
         self._space, self._config, self.usual, self._near = space, config, usual, near
         self.widest = chi2_quantile(config.probability, space.dimension)
-        turns = np.diag(space.diagonal(1.0, 0.0)) > 0
-        self._turns, self._moves = np.flatnonzero(turns), np.flatnonzero(~turns)
+        self._turns, self._moves = _axes(space.diagonal(1.0, 0.0)), _axes(space.diagonal(0.0, 1.0))
 
-    def exact(self, measured: Path, path: Path) -> tuple[float, float]:
-        """The statistic if odometry did not err at all, and how far (m) the noise of the loops alone may reach."""
-        found = self.compare(measured, path, Noise(odometry=0.0), drift=0.0)
-        return found.statistic, found.bound[0]
+    def exact(self, measured: Path, expected: Pose, noise: Array) -> float:
+        """The statistic if what is expected were true to within a noise that leaves out the odometry's; infinite where that noise is
+        so wide that an end further off than `near` would be as likely.
+        """
+        loops = measured.loops + noise
+        statistic = _distance(self._space.logmap(expected.between(measured.pose)), loops)
+        reach = _width(loops[self._moves, self._moves], statistic)
+        return statistic if reach <= self._near else inf
 
     @property
     def threshold(self) -> float:
@@ -76,26 +80,24 @@ class Ruler:
     ) -> Accord:  # frozen
         """measured: one relative pose as a path of its own. noise, drift: instead of those that are."""
         drift = self._config.drift if drift is None else drift
-        scale = self._config.odometry_scale * noise.odometry**2
-        odometry = path.covariance(scale, noise.rotation) - path.loops
+        odometry = path.drifted(self._config.odometry_scale * noise.odometry**2, noise.rotation)
         loops = noise.loop**2 * measured.loops + path.loops
         residual = self._space.logmap(path.pose.between(measured.pose))
-        threshold = self.threshold
-        reach = drift * path.meters
-        try:
-            statistic = float(residual @ np.linalg.solve(odometry + loops, residual))
-        except np.linalg.LinAlgError:
-            statistic = np.nan
-        if not np.isfinite(statistic):  # numbers near the end of the scale say nothing
-            return Accord(np.inf, threshold, (np.inf, np.inf), (reach, 0.0), reach)
-        sure = min(reach, _width(odometry, self._moves, threshold))
-        # a heading that is off by twice the drift all the way moves the end by more than the drift; it wanders on
-        bound = (
-            reach + _width(loops, self._moves, self.widest),
-            2 * drift * (1 + path.meters / WANDER) + _width(loops, self._turns, self.widest),
-        )
-        away = float(np.linalg.norm(residual[self._moves])), float(np.linalg.norm(residual[self._turns]))
-        return Accord(statistic, threshold, away, bound if sure <= self._near else (np.inf, np.inf), sure)
+        threshold, reach = self.threshold, drift * path.meters
+        statistic = _distance(residual, odometry + loops)
+        if statistic == inf:  # numbers near the end of the scale say nothing
+            return Accord(inf, threshold, (inf, inf), (reach, 0.0), reach)
+        sure = min(reach, _width(odometry[self._moves, self._moves], threshold))
+        bound = (inf, inf)
+        if sure <= self._near:
+            # a heading that is off by twice the drift all the way moves the end by more than the drift; it wanders on
+            turned = 2 * drift * (1 + path.meters / WANDER)
+            bound = (
+                reach + _width(loops[self._moves, self._moves], self.widest),
+                turned + _width(loops[self._turns, self._turns], self.widest),
+            )
+        away = _length(residual[self._moves]), _length(residual[self._turns])
+        return Accord(statistic, threshold, away, bound, sure)
 
     def remedy(self, measured: Path, path: Path) -> tuple[Noise, float]:
         """The smallest change with which `compare` would pass: factors of one noise, and the drift.
@@ -107,7 +109,7 @@ class Ruler:
         if self.compare(measured, path, drift=drift):
             return Noise(), drift
         for cause in ("rotation", "odometry", "loop"):
-            factor = self._factor(measured, path, cause, drift)
+            factor = self._factor(measured, path, cause)
             if factor <= LARGEST:
                 break
         return replace(Noise(), **{cause: factor}), drift
@@ -122,27 +124,62 @@ class Ruler:
         ]
         return (drift + max(0.0, *over)) * (1 + PRECISION)
 
-    def _factor(self, measured: Path, path: Path, cause: str, drift: float) -> float:
-        """By bisection, since the statistic falls as a noise grows; infinite beyond LARGEST, except for the measurement's own."""
+    def _factor(self, measured: Path, path: Path, cause: str) -> float:
+        """With which the statistic passes, by bisection, since it falls as a noise grows; infinite beyond LARGEST, except for the
+        measurement's own.
+        """
+        odometry = path.drifted(self._config.odometry_scale)
+        parts = {
+            "rotation": self._config.odometry_scale * path.rotation, "odometry": odometry, "loop": measured.loops
+        }  # fmt: skip
+        grows = parts[cause]
+        rest = odometry + measured.loops + path.loops - grows
+        residual = self._space.logmap(path.pose.between(measured.pose))
+        threshold = self.threshold
 
         def passes(factor: float) -> bool:
-            return bool(self.compare(measured, path, replace(Noise(), **{cause: factor}), drift))
+            return _distance(residual, rest + factor**2 * grows) <= threshold
 
         low, high = 1.0, 2.0
         while not passes(high):
             low, high = high, 2 * high
             if high > LARGEST and cause != "loop":
-                return np.inf
+                return inf
         while high - low > PRECISION * low / 2:
             middle = (low + high) / 2
             low, high = (low, middle) if passes(middle) else (middle, high)
-        return high
+        return high * (1 + PRECISION / 2)
 
 
-def _width(covariance: Array, axes: Any, threshold: float) -> float:
+def _axes(diagonal: Array) -> slice:
+    """Those on which it is not zero; they lie side by side."""
+    rows = np.flatnonzero(np.diag(diagonal))
+    return slice(int(rows[0]), int(rows[-1]) + 1)
+
+
+def _distance(residual: Array, covariance: Array) -> float:
+    """Squared, by Mahalanobis; infinite where the numbers allow none."""
+    try:
+        found = float(residual @ np.linalg.solve(covariance, residual))
+    except np.linalg.LinAlgError:
+        return inf
+    return found if isfinite(found) else inf
+
+
+def _width(covariance: Array, threshold: float) -> float:
     """How far along its longest axis a covariance reaches at a threshold."""
-    variance = float(np.linalg.eigvalsh(covariance[np.ix_(axes, axes)])[-1])
-    return float(np.sqrt(threshold * max(variance, 0.0)))
+    if len(covariance) == 1:
+        variance = float(covariance[0, 0])
+    elif len(covariance) == 2:
+        (a, b), (_, c) = covariance.tolist()
+        variance = (a + c) / 2 + hypot((a - c) / 2, b)
+    else:
+        variance = float(np.linalg.eigvalsh(covariance)[-1])
+    return sqrt(threshold * max(variance, 0.0))
+
+
+def _length(vector: Array) -> float:
+    return sqrt(float(vector @ vector))
 
 
 def told(noise: Noise, drift: float, usual: float) -> tuple[dict[str, float], str]:

@@ -187,7 +187,7 @@ class Gate:
         return tuple(self._paths.factors[id_] for id_ in sorted(ids))
 
     def _stirred(self) -> Iterable[Factor]:
-        """Refused loops beside one that has come into the graph, or has gone, since the last review."""
+        """Refused loops beside one that has come into the graph and agrees with them, or has gone, since the last review."""
         entered, left = self._paths.entered[self._entered :], self._paths.left[self._left :]
         self._entered, self._left = len(self._paths.entered), len(self._paths.left)
         for loop in entered:
@@ -196,16 +196,25 @@ class Gate:
                 self._inside.add(loop)
                 if (statistic := self._statistics.pop(loop.id, None)) is not None:
                     self._ruler.usual.add(statistic)
-                self._suspects |= {near.id: near for near in (loop, *self._inside.beside(loop)[:VOTERS])}
+                if against := self._votes(loop)[1]:
+                    self._suspects |= {id_: self._inside[id_] for id_ in (loop.id, *against)}
         for loop in left:
             if loop.id not in self._paths.loops:
                 self._inside.drop(loop.id)
                 self._suspects.pop(loop.id, None)
                 if loop.id not in self._given_up:
                     self._refused.add(loop)
-        return {
-            near.id: near for loop in (*entered, *left) for near in self._refused.beside(loop)[:STIRRED]
-        }.values()
+        stirred: dict[str, Factor] = {}
+        for loop, is_in in [(loop, True) for loop in entered] + [(loop, False) for loop in left]:
+            for near in self._refused.beside(loop)[:STIRRED]:
+                if not is_in or self._speaks_for(loop, near):
+                    stirred[near.id] = near
+        return stirred.values()
+
+    def _speaks_for(self, loop: Factor, refused: Factor) -> bool:
+        """Whether the way over an accepted loop leads to where a refused one ends, or cannot tell."""
+        accord = self._refused.accord(refused, loop)
+        return accord is None or (accord.possible and accord.statistic <= self._ruler.threshold)
 
     def _forget(self, id_: str) -> None:
         self._refused.drop(id_)

@@ -83,9 +83,13 @@ class Held:
         first, second = min(one.id, other.id), max(one.id, other.id)
         known = self._agreed[first]
         if second not in known:
-            cycle = self._around(one, other)
-            known[second] = None if cycle is None else self._ruler.compare(self._paths.path_of(one), cycle)
+            known[second] = self.accord(one, other)
         return known[second]
+
+    def accord(self, one: Factor, other: Factor) -> Accord | None:
+        """The same of loops that need not be held."""
+        cycle = self._around(one, other)
+        return None if cycle is None else self._ruler.compare(self._paths.path_of(one), cycle)
 
     def _around(self, one: Factor, other: Factor) -> Path | None:
         """From a to b of one loop by way of the other."""

@@ -40,7 +40,13 @@ class Path:
 
     def covariance(self, scale: float, rotation: float = 1.0) -> Array:
         """With the odometry's covariance multiplied by `scale`, and its standard deviations of rotation by `rotation` besides."""
-        return scale * (self.odometry + (rotation**2 - 1) * self.rotation) + self.loops
+        return self.drifted(scale, rotation) + self.loops
+
+    def drifted(self, scale: float, rotation: float = 1.0) -> Array:
+        """The part of it that is the odometry's."""
+        if rotation == 1.0:
+            return scale * self.odometry
+        return scale * (self.odometry + (rotation**2 - 1) * self.rotation)
 
     def then(self, other: "Path") -> "Path":
         adjoint = other.pose.inverse().AdjointMap()
@@ -274,6 +280,7 @@ class Sides:
         self._chain = np.zeros(64, dtype=np.int64)
         self._price = np.zeros(64)  # of the way from the chain's origin
         self._own = np.zeros(64)  # of crossing the link; infinite: removed
+        self._chains = 1  # that the links end on, at most
 
     def add(self, chain_a: int, price_a: float, chain_b: int, price_b: float, own: float) -> None:
         n = self._count
@@ -285,6 +292,7 @@ class Sides:
         self._price[n : n + 2] = price_a, price_b
         self._own[n : n + 2] = own
         self._count += 2
+        self._chains = max(self._chains, chain_a + 1, chain_b + 1)
 
     def remove(self, link: int) -> None:
         self._own[2 * link : 2 * link + 2] = np.inf
@@ -297,27 +305,34 @@ class Sides:
         n = self._count
         if not n:
             return []
-        chain, price, own = self._chain[:n], self._price[:n], self._own[:n].copy()
-        own[[2 * link + end for link in closed for end in (0, 1)]] = np.inf
-        out = np.arange(n) ^ 1
+        chain, price, own = self._chain[:n], self._price[:n], self._own[:n]
+        if closed:
+            own = own.copy()
+            own[[2 * link + end for link in closed for end in (0, 1)]] = np.inf
         # what it costs to have crossed the link that begins at a side, and to go on to b from its other side
-        crossed = np.where(chain == chain_a, np.abs(price - price_a), np.inf) + own
-        to_b = np.where(chain[out] == chain_b, np.abs(price[out] - price_b), np.inf)
+        crossed = self._walk(chain_a, price_a) + own
+        to_b = self._walk(chain_b, price_b).reshape(-1, 2)[:, ::-1].ravel()
         whole = crossed + to_b  # of the best way that ends with this link
         before = np.full(n, -1)
         left = crossed.copy()
+        best = min(on_foot, float(whole.min()))
         for _ in range(min(STEPS, n)):
             side = int(left.argmin())
             so_far = left[side]
-            if not so_far < min(on_foot, whole.min()):
+            if not so_far < best:
                 break
             left[side] = np.inf
-            here = price[side ^ 1]
-            onward = np.where(chain == chain[side ^ 1], so_far + np.abs(price - here), np.inf) + own
-            better = np.flatnonzero(onward < crossed)
-            crossed[better] = left[better] = onward[better]
-            whole[better] = onward[better] + to_b[better]
-            before[better] = side
+            onward = self._walk(int(chain[side ^ 1]), price[side ^ 1])
+            onward += own
+            onward += so_far
+            better = (onward < crossed).nonzero()[0]
+            if len(better):
+                onward = onward[better]
+                crossed[better] = left[better] = onward
+                onward += to_b[better]
+                whole[better] = onward
+                before[better] = side
+                best = min(best, float(onward.min()))
         last = int(whole.argmin())
         if not whole[last] < on_foot:
             return []
@@ -326,6 +341,14 @@ class Sides:
             sides.append(last)
             last = int(before[last])
         return sides[::-1]
+
+    def _walk(self, chain: int, price: float) -> Array:
+        """On foot from a point of a chain to every side."""
+        found = self._price[: self._count] - price
+        np.abs(found, out=found)
+        if chain or self._chains > 1:
+            found[self._chain[: self._count] != chain] = np.inf
+        return found
 
 
 def _joined(path: Path | None, further: Path | None) -> Path:

@@ -15,10 +15,11 @@ from ..graph import Decision, Delta, Estimate, Factor, Verdict
 from .accord import Ruler
 from .chi2 import chi2_quantile
 from .held import Held
-from .paths import Paths
+from .paths import Path, Paths
 from .stage import Judged
 
 SHARPER = 3.0  # how much surer than the gate odometry between two loops must be, for them to be witnesses
+TURNS = 8  # of what waits, looked at with each loop that enters
 
 
 class Witness:
@@ -33,12 +34,13 @@ class Witness:
         self._fresh: list[Factor] = []  # not told about yet
         self._round: list[str] = []  # of what waits, whose turn comes yet; the next one last
         self._entered = self._left = 0  # of what came into the graph, and went
+        self._changes = 0  # of the graph's loops, when it was last somebody's turn
 
-    def admit(self, proposed: Delta, estimate: Estimate) -> Judged:  # noqa: ARG002  # odometry and loops say enough
+    def admit(self, proposed: Delta, estimate: Estimate) -> Judged:
         """Near loops; all others wait for the review that follows, which decides about them."""
         kept, decisions = [], []
         for loop in proposed.add:
-            decision = self._alone(loop)
+            decision = self._alone(loop, estimate)
             if decision is None:
                 self._known.add(loop)
                 self._waiting[loop.id] = np.inf
@@ -48,13 +50,13 @@ class Witness:
                 decisions.append(decision)
         return Delta(tuple(kept), proposed.remove, proposed.values), tuple(decisions)
 
-    def review(self, estimate: Estimate) -> Judged:  # noqa: ARG002
+    def review(self, estimate: Estimate) -> Judged:
         """What waits is looked at again when it is new, or when a loop beside it has entered."""
         fresh, self._fresh = self._fresh, []
         entering: dict[str, Decision] = {}
-        for loop in (*fresh, *self._stirred(), *self._turn()):
+        for loop in (*fresh, *self._stirred(), *self._turn(estimate)):
             if loop.id in self._waiting and loop.id not in entering:
-                decision = self._alone(loop)
+                decision = self._alone(loop, estimate)
                 entering |= {loop.id: decision} if decision else self._witnessed(loop)
         for id_ in entering:
             del self._waiting[id_]
@@ -74,16 +76,28 @@ class Witness:
             if loop.id in self._paths.loops:  # however it came in, and has not left again
                 self._waiting.pop(loop.id, None)
                 self._known.add(loop)
-                stirred |= {near.id: near for near in self._known.beside(loop) if near.id in self._waiting}
+                if self._waiting:
+                    stirred |= {
+                        near.id: near for near in self._known.beside(loop) if near.id in self._waiting
+                    }
         return stirred.values()
 
-    def _turn(self) -> Iterable[Factor]:
-        """One after the other, since what has entered far away may have shown a shorter way between the ends of any of them."""
-        if (self._round and self._round[-1] not in self._waiting) or not self._round:
-            self._round = [id_ for id_ in self._round if id_ in self._waiting] or list(self._waiting)[::-1]
-        return [self._known[self._round.pop()]] if self._round else []
+    def _turn(self, estimate: Estimate) -> Iterable[Factor]:
+        """One after the other, since what has entered far away may have shown a shorter way between the ends of any of them; of
+        some more those that the graph has come to expect. At the end of the input all.
+        """
+        if self._paths.ended:
+            return [self._known[id_] for id_ in self._waiting]
+        if self._entered + self._left == self._changes:
+            return []
+        self._changes = self._entered + self._left
+        self._round = [id_ for id_ in self._round if id_ in self._waiting] or list(self._waiting)[::-1]
+        turns = [self._known[self._round.pop()] for _ in range(min(TURNS, len(self._round)))]
+        return turns[:1] + [
+            loop for loop in turns[1:] if self._surprise(loop, estimate) <= self._ruler.widest
+        ]
 
-    def _alone(self, loop: Factor) -> Decision | None:
+    def _alone(self, loop: Factor, estimate: Estimate) -> Decision | None:
         """Why it may enter without others, if it may."""
         path = self._paths.cheapest(loop.keys)
         if path is None:
@@ -99,14 +113,30 @@ class Witness:
         if found.sure <= self._config.near:
             words = f"the graph knows to within {found.sure:.2g} m where it ends"
             return _decision(loop, "accepted", "near", words, found.sure, self._config.near)
-        statistic, reach = self._ruler.exact(measured, path)
-        if statistic <= self._ruler.widest and reach <= self._config.near:
-            words = f"after {path.meters:.0f} m odometry expects it here, to within its own noise: no chance would do that"
-            return _decision(loop, "accepted", "exact", words, statistic, self._ruler.widest)
+        if exact := self._exact(loop, path, estimate):
+            return exact
         if found.statistic <= self._lone:
             words = f"alone, and close to where {path.meters:.0f} m of odometry expect it"
             return _decision(loop, "accepted", "lone", words, found.statistic, self._lone)
         return None
+
+    def _exact(self, loop: Factor, path: Path, estimate: Estimate) -> Decision | None:
+        """If it falls where the way without odometry's noise, or all of the graph together, has it."""
+        statistic = self._ruler.exact(self._paths.path_of(loop), path.pose, path.loops)
+        who = f"after {path.meters:.0f} m odometry expects"
+        if statistic > self._ruler.widest:
+            statistic = self._surprise(loop, estimate)
+            who = "all of the graph together expects"
+        if statistic > self._ruler.widest:
+            return None
+        words = f"{who} it here, to within its own noise: no chance would do that"
+        return _decision(loop, "accepted", "exact", words, statistic, self._ruler.widest)
+
+    def _surprise(self, loop: Factor, estimate: Estimate) -> float:
+        """How far the estimate is from it, in its own noise."""
+        a, b = (estimate.pose(key) for key in loop.keys)
+        own = self._paths.path_of(loop)
+        return self._ruler.exact(own, a.between(b), 0.0 * own.loops)
 
     def _witnessed(self, loop: Factor) -> dict[str, Decision]:
         """A clique that is large enough: the decisions about its members that wait."""
