@@ -182,7 +182,7 @@ class Applier:
                 self._wake(key)
             if factor.kind == "datum" and (part := self._parts.of(factor.keys[0])) is not None:
                 self._parts.release(part)
-            if factor.kind in ("loop", "pose"):
+            if factor.kind in ("loop", "pose") or factor.id in self._verdicts:
                 self.decisions.append(self._verdicts.get(factor.id) or _accepted(factor))
         self._booked(delta)
 

@@ -40,7 +40,7 @@ from .measurement import SECOND, Array, Measurement, StaticTransform
 from .mounts import Mounts
 from .parts import Parts
 from .reunion import Reunion, reunion
-from .robust import ROBUST, Robust
+from .robust import ROBUST, Doubt, Robust
 from .robust.paths import Paths
 from .sensors import SENSORS
 from .sensors.gnss import Fix
@@ -97,7 +97,7 @@ class Backend:
         self.space = space = SPACES[config.space]
         self.solver = solver or SOLVERS["isam2"](config, space)
         self._paths = paths = Paths(space, config.gate.odometry_scale, self.solver.factors)
-        self._robust = [ROBUST[name](config, paths) for name in config.robust] if robust is None else robust
+        self._robust = _stages(config, paths) if robust is None else robust
         self._driver = config.driver
         if self._driver is None:
             raise BadConfig("no source drives the keyframes: add one of kind odometry or relative")
@@ -489,7 +489,10 @@ class Backend:
         for stage in stages:
             if not proposed.add:
                 break
-            proposed, decisions = stage.admit(proposed, self.estimate)
+            mine = tuple(factor for factor in proposed.add if factor.kind in stage.kinds)
+            others = tuple(factor for factor in proposed.add if factor.kind not in stage.kinds)
+            admitted, decisions = stage.admit(replace(proposed, add=mine), self.estimate)
+            proposed = replace(admitted, add=(*admitted.add, *others))
             kept = {factor.id for factor in proposed.add}
             for each in decisions:
                 before = passed.get(each.id, each)
@@ -534,3 +537,12 @@ class Backend:
         self._editor.note(decisions)
         sevens = self.space.seven(pose), self.space.seven(correction)
         return Update(b, *sevens, self._revision, decisions, self._origin)
+
+
+def _stages(config: Config, paths: Paths) -> list[Robust]:
+    """What judges proposed factors: loops as the configuration says, fixes on the earth always."""
+    fixes = any(isinstance(source, GnssSource) for source in config.sources.values())
+    return [
+        *(ROBUST[name](config, paths) for name in config.robust),
+        *([Doubt(config, paths)] if fixes else []),
+    ]

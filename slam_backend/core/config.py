@@ -352,6 +352,7 @@ class GnssSource(Observing):
         lt=1,
         description="with which a true fix passes, if all noise is as stated; others are doubted",
     )
+    agreeing_for: float = Field(3.0, ge=0, le=3600, description="s over which these must reach at least")
     withhold: tuple[tuple[float, float], ...] = Field(
         (), description="spans [from, to] in s after its first fix, whose fixes are kept back as a truth"
     )

@@ -9,7 +9,11 @@ from .graph import Decision
 from .measurement import SECOND, format_stamp
 
 # stages that a flood of bad messages can fill
-ABOUT_RECORDS = frozenset({"decode", "check", "settle", "recheck", "landmark", "odometry", "pose", "gnss", "session"})
+ABOUT_RECORDS = frozenset(
+    {"decode", "check", "settle", "recheck", "landmark", "odometry", "pose", "gnss", "session"}
+)
+
+EVERYDAY = ("doubt", "expected")  # a fix that is where it should be: ten a second, for days
 
 
 class DecisionLog:
@@ -20,7 +24,7 @@ class DecisionLog:
         self._floods: dict[tuple[str, str, str, int], int] = {}
 
     def add(self, decision: Decision) -> None:
-        if decision.stage in ABOUT_RECORDS:
+        if decision.stage in ABOUT_RECORDS or (decision.stage, decision.reason) == EVERYDAY:
             key = (decision.source, decision.stage, decision.reason, decision.stamp // SECOND)
             if (at := self._floods.get(key)) is not None:
                 first = self._kept[at]

@@ -25,6 +25,7 @@ STAGES = {
     "wait": "While waiting for a keyframe",
     "*": "Where it lands",
     "gnss": "Fixes on the earth",
+    "doubt": "Fixes beside what is expected of them",
 }
 
 

@@ -1,13 +1,25 @@
 """Proof by sampling, for everything that carries a covariance; and a drive that most tests of the whole core begin from."""
 
+from types import SimpleNamespace
+
 import numpy as np
+import pymap3d
 import pytest
 
-from slam_backend.core.measurement import SECOND
+from slam_backend.core.backend import Backend
+from slam_backend.core.config import config_from
+from slam_backend.core.graph import EARTH
+from slam_backend.core.measurement import SECOND, frozen
+from slam_backend.core.sensors.gnss import Fix
 from slam_backend.core.sensors.odometry import STILL, UNKNOWN, OdometryPose
 from slam_backend.core.sensors.relative import RelativePose
+from slam_backend.core.space import SPACES
 
 SIDE = 8  # keyframes of each side of the square
+ORIGIN = (42.3758, -71.1474, 12.0)
+ARM = (0.8, -0.3, 1.2)
+YAW = 2.0  # rad, of the earth in the map
+SIGMA = 0.3  # m, of a fix
 
 
 @pytest.fixture
@@ -75,3 +87,58 @@ def loop_fixture():
 
 def loop(stamp, stamp_i, stamp_j, motion):
     return RelativePose(stamp, "relative", stamp_i, stamp_j, "base", "base", seven(*motion), np.zeros(36))
+
+
+@pytest.fixture
+def road():
+    """A robot with an antenna on a winding road, the yaw of its map unknown."""
+    return SimpleNamespace(
+        drive=drive, backend=on_earth, run=run_through, errors=errors, origin=ORIGIN, sigma=SIGMA
+    )
+
+
+def drive(space, seed=0, seconds=120):
+    """Odometry along a winding road, once a second, and a fix with noise after each: (measurements, true poses on the earth)."""
+    rng, space = np.random.default_rng(seed), SPACES[space]
+    pose, odometry = space.identity, space.identity
+    start = space.from_extrinsics((40.0, -25.0, 3.0, 0.0, 0.0, -YAW))  # earth_T_map
+    items, truth = [], []
+    arm = np.array(ARM[: space.point_dimension])
+    for k in range(seconds):
+        stamp = (k + 1) * SECOND
+        seven = frozen(space.seven(odometry))
+        items.append(OdometryPose(stamp, "wheels", "odom", "base", seven, UNKNOWN, STILL, UNKNOWN))
+        truth.append(start.compose(pose))
+        antenna = np.append(truth[-1].transformFrom(arm), np.zeros(3 - len(arm)))
+        place = pymap3d.enu2geodetic(*(antenna + rng.normal(0, SIGMA, 3)), *ORIGIN)
+        items.append(Fix(stamp, "gps", "antenna", frozen(place), frozen(np.eye(3) * SIGMA**2)))
+        step = space.from_extrinsics((1.0, 0.0, 0.05 * np.sin(k / 9), 0.0, 0.0, 0.1 * np.sin(k / 10)))
+        pose = pose.compose(step)
+        noise = rng.normal(0, 1, space.dimension) * np.sqrt(np.diag(space.diagonal(0.01**2, 0.03**2)))
+        odometry = odometry.compose(step).compose(space.expmap(noise))
+    return items, truth
+
+
+def on_earth(space, **more):
+    sources = {"wheels": {"kind": "odometry"}, "gps": {"kind": "gnss"}, **more.pop("sources", {})}
+    wheels = {"sigma_translation_per_meter": 0.03, "sigma_rotation_per_meter": 0.01}
+    data = {"space": space, "sources": list(sources), **sources, "extrinsics": {"antenna": [*ARM, 0, 0, 0]}}
+    return Backend(config_from({**data, "wheels": {**sources["wheels"], **wheels}, **more}))
+
+
+def errors(found, truth) -> np.ndarray:
+    """(N,) m between where the keyframes are believed to be on the earth, and where they are."""
+    earth = found.estimate.pose(EARTH)
+    return np.array(
+        [
+            np.linalg.norm(earth.between(found.estimate.pose(k.pose)).translation() - true.translation())
+            for k, true in zip(found.timeline.keyframes, truth, strict=True)
+        ]
+    )
+
+
+def run_through(found, items):
+    decisions = [d for item in items for update in found.add(item) for d in update.decisions]
+    decisions += [d for update in found.finish() for d in update.decisions]
+    found.polish()
+    return decisions

@@ -147,6 +147,11 @@ RULES: Mapping[str, Rule] = {
         "error", "nobody says where this frame is on the robot", "add it to 'extrinsics' or send it on /tf_static"
     ),
     "check/no_fix": Rule("note", "the receiver says that it has no fix", "nothing; if it is often so, look at the antenna", 0.0),
+    "doubt/unexpected": Rule(
+        "warn", "a fix is not where the odometry expects it; kept aside until others agree with it",
+        "if it is often so: state larger sigmas for the odometry or the fixes, or set a kernel", None, "", "<gnss>.probability",
+    ),
+    "doubt/alone": Rule("warn", "a doubted fix with which no other agreed", "look for reflections; see doubt/unexpected"),
     "gnss/withheld": Rule("note", "kept back as a truth, as the configuration wants", "nothing; see withhold and withhold_every"),
     "check/off_earth": Rule(
         "error", "latitude or longitude is out of range, or both are zero",
