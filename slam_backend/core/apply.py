@@ -10,7 +10,7 @@ from .parts import Parts
 from .sessions import SavedMap
 from .solvers import Solver
 from .space import Space
-from .variables import moved, seen_from, value_in
+from .variables import moved, pose_beside, seen_from, value_in
 
 FOUNDATION = frozenset({"gauge", "motion"})  # kinds without which a keyframe cannot be
 
@@ -176,9 +176,10 @@ class Applier:
     def _book(self, delta: Delta) -> None:
         for factor in delta.add:
             fresh = [key for key in factor.keys if self._parts.of(key) is None]
+            pose = pose_beside(factor.keys[0])
             for key in fresh:
-                self._parts.put(key, factor.keys[0])
-                self.sighted[key] = (factor.keys[0], self._from(factor.keys[0], delta, key))
+                self._parts.put(key, pose)
+                self.sighted[key] = (pose, self._from(pose, delta, key))
                 self._wake(key)
             if factor.kind == "datum" and (part := self._parts.of(factor.keys[0])) is not None:
                 self._parts.release(part)

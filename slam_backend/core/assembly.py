@@ -15,7 +15,7 @@ from .graph import Factor, is_pose
 from .growth import gauge
 from .parts import Parts
 from .space import Space
-from .variables import moved, value_in
+from .variables import moved, pose_beside, value_in
 
 Sighted = Mapping[
     int, tuple[int, Any]
@@ -63,8 +63,10 @@ class _Builder:
 
     def tie(self, factor: Factor) -> None:
         """Its variables belong together."""
-        first, *others = factor.keys
-        for key in others:
+        first = pose_beside(factor.keys[0])
+        for key in factor.keys:
+            if key == first:
+                continue
             if self.parts.of(key) is None:
                 self.parts.put(key, first)
                 if self._before.exists(key):

@@ -14,7 +14,7 @@ from .apply import Applier, touched, without
 from .beside import Beside
 from .command import Command
 from .config import Config, GnssSource, LandmarkSource, OdometrySource, PoseSource, RelativeSource
-from .context import Context
+from .context import Context, unknown_frame
 from .editor import Editor, Shift
 from .edits import Wishes
 from .errors import BadConfig, SlamError, SolverFailure
@@ -31,10 +31,12 @@ from .graph import (
     Keyframe,
     Offer,
     Pose,
+    identify,
     landmark_key,
     total,
 )
 from .growth import Growth
+from .inertial import ImuSample, Inertial, State, Stretch, imu_of, pace_from
 from .keyframes import Timeline, Track, due
 from .measurement import SECOND, Array, Measurement, StaticTransform
 from .mounts import Mounts
@@ -44,6 +46,7 @@ from .robust import ROBUST, Doubt, Robust
 from .robust.paths import Paths
 from .sensors import SENSORS
 from .sensors.gnss import Fix
+from .sensors.imu import bias_key, velocity_key
 from .sensors.odometry import HERE, OdometryPose, stated
 from .sensors.relative import RelativePose
 from .sessions import SavedMap, Tracks, fits, joined
@@ -52,7 +55,9 @@ from .solvers import SOLVERS, Solver
 from .space import SPACES
 from .trajectory import Snapshot, Trajectory
 from .variables import moved
-from .waiting import Waiting
+from .waiting import Waiting, refusal
+
+STEP = SECOND // 20  # ns between samples of the track where the IMU drives
 
 SOURCES = {  # of a configuration that names none: one of each kind, by the name of its kind
     "odometry": OdometrySource(),
@@ -100,9 +105,13 @@ class Backend:
         self._robust = _stages(config, paths) if robust is None else robust
         self._driver = config.driver
         if self._driver is None:
-            raise BadConfig("no source drives the keyframes: add one of kind odometry or relative")
+            raise BadConfig("no source drives the keyframes: add one of kind odometry, imu or relative")
         driving = config.sources[self._driver]
         self._relative = driving.kind == "relative"
+        self._imu = next((name for name, s in config.sources.items() if s.kind == "imu"), "")
+        self._inertial = Inertial(self._imu, imu) if (imu := imu_of(config)) else None
+        self._pace = pace_from(config)
+        self._stretch: Stretch | None = None  # of the keyframe that is being made
         self.track = Track(space, driving if isinstance(driving, OdometrySource) else OdometrySource())
         self.tracks = Tracks(self.track)
         self.timeline = Timeline()
@@ -166,6 +175,8 @@ class Backend:
         if isinstance(measurement, OdometryPose) and measurement.source in self._beside:
             self._decisions += self._beside[measurement.source].add(measurement, bool(self._newest))
             return []
+        if isinstance(measurement, ImuSample) and self._inertial and measurement.source == self._imu:
+            return self._sample(measurement, self._inertial)
         if self._relative and isinstance(measurement, RelativePose) and measurement.source == self._driver:
             self._mounts.name_base(measurement.frame_j)
         if isinstance(measurement, Fix) and not self._takes(measurement):
@@ -286,39 +297,113 @@ class Backend:
         seconds = (odometry.stamp - self.track.newest) / SECOND if len(self.track) else 0.0
         noise = stated(self.space, self.track.noise, odometry, seconds)
         (self.track.leap if restarted else self.track.add)(odometry.stamp, pose, noise)
+        return self._reached(odometry.stamp, restarted)
+
+    def _reached(self, stamp: int, restarted: bool = False) -> list[Update]:
+        """The track has come to this stamp: keyframes that were asked for, then one there if it is due."""
         updates: list[Update] = []
-        for stamp in self._waiting.asked(odometry.stamp):
-            if self.track.covers(stamp) and (self._newest is None or stamp > self._newest[0].stamp):
-                updates += self._extend(stamp)
+        for wanted in self._waiting.asked(stamp):
+            if self.track.covers(wanted) and (self._newest is None or wanted > self._newest[0].stamp):
+                updates += self._extend(wanted)
         if self._newest is None:
-            return updates + self._extend(odometry.stamp)
+            return updates + self._extend(stamp)
         newest, there = self._newest
-        elapsed = odometry.stamp - newest.stamp
-        moved = there.between(pose)
-        if elapsed > 0 and (restarted or due(self.config.keyframes, self.space, moved, elapsed)):
-            updates += self._extend(odometry.stamp)
+        moved, elapsed = there.between(self.track.pose(stamp)), stamp - newest.stamp
+        if elapsed > 0 and (restarted or due(self._pace, self.space, moved, elapsed)):
+            updates += self._extend(stamp)
+        return updates
+
+    def _sample(self, sample: ImuSample, inertial: Inertial) -> list[Update]:
+        """The IMU says something: kept for the next keyframe; where it drives, the track follows."""
+        drives = self._imu == self._driver
+        if drives:
+            self._mounts.name_base(sample.frame)
+        mount = self._mounts.get(sample.frame)
+        if mount is None:
+            why = unknown_frame(sample.frame)
+            self._decisions.append(refusal(Offer(identify(sample, 0), sample), "imu", why.reason, why.detail))
+            return []
+        inertial.add(sample, None if mount is self.space.identity else mount)
+        return self._propagate(sample, inertial) if drives else []
+
+    def _propagate(self, sample: ImuSample, inertial: Inertial) -> list[Update]:
+        updates: list[Update] = []
+        if self._newest is None:
+            if (first := inertial.ready) is None:
+                return []
+            updates += self._extend(first)
+        for wanted in self._waiting.asked(sample.stamp):
+            if self._newest and wanted > self._newest[0].stamp:
+                updates += self._extend(wanted)
+        if self._newest and sample.stamp - self.track.newest >= STEP:
+            self.track.add(sample.stamp, self._newest[1].compose(inertial.moved(sample.stamp)))
+            updates += self._reached(sample.stamp)
         return updates
 
     def _extend(self, stamp: int) -> list[Update]:
         """A new keyframe at a stamp that the odometry covers, with everything that lands there."""
         a = self._newest[0] if self._newest else None
+        driver, settings = str(self._driver), self.config.sources[str(self._driver)]
+        level = self._inertial.level() if self._inertial else None
+        stretch = self._stretched(stamp)
+        if settings.kind == "imu" and stretch is None:
+            return []
         if a is None:
-            b, delta = self._growth.start(stamp)
+            b, delta = self._growth.start(stamp, level)
         else:
-            b = self._growth.follow(a, stamp)
-            odometry = [Offer("", Measurement(stamp, str(self._driver)))]
-            settings = self.config.sources[str(self._driver)]
-            delta = SENSORS["odometry"].factors(odometry, a, b, self._context({}), settings)
+            b, delta = self._growth.follow(a, stamp), Delta()
+        motion = [Offer("", Measurement(stamp, driver), motion=True)]
+        delta += SENSORS[settings.kind].factors(motion, a, b, self._context({}), settings)
+        if settings.kind == "imu" and stretch is not None:
+            self._follow(stretch)
         self._newest = (b, self.track.pose(stamp))
         self.track.protect()
         window = self._waiting.window(stamp)
-        delta += Delta(self._edges_beside()) + self._factors(window, a, b, delta.values)
-        return self._update(b, delta, [b], window)
+        others = (
+            [Offer("", Measurement(stamp, self._imu))] if stretch is not None and self._imu != driver else []
+        )
+        delta += Delta(self._edges_beside()) + self._factors(others + window, a, b, delta.values)
+        updates = self._update(b, delta, [b], window)
+        self._begun(b, stretch)
+        return updates
 
     def _edges_beside(self) -> tuple[Factor, ...]:
         """By the odometries that do not drive."""
         keyframes, context = self.timeline.keyframes, self._context({})
         return tuple(edge for each in self._beside.values() for edge in each.edges(keyframes, context))
+
+    def _stretched(self, stamp: int) -> Stretch | None:
+        """What the IMU measured since the newest keyframe."""
+        if self._inertial is not None:
+            self._stretch = self._inertial.cut(stamp)
+            self._decisions += self._inertial.take_decisions()
+        return self._stretch
+
+    def _begun(self, b: Keyframe, stretch: Stretch | None) -> None:
+        """The IMU goes on from a new keyframe; from the one before, if that was taken back."""
+        self._stretch = None
+        if self._inertial is None:
+            return
+        if self.timeline.at(b.stamp) is not b:
+            self._inertial.lose(stretch)
+            return
+        driven = stretch.end if stretch is not None and self._imu == self._driver else None
+        self._inertial.begin(self._state(b) or driven, b.stamp)
+
+    def _follow(self, stretch: Stretch) -> None:
+        """The track goes where the IMU leads."""
+        there, end = self.space.identity if self._newest is None else self._newest[1], stretch.end
+        if stretch.start is None:
+            self.track.add(end.stamp, end.pose)
+        elif end.stamp != self.track.newest:
+            self.track.add(end.stamp, there.compose(stretch.start.pose.between(end.pose)))
+
+    def _state(self, keyframe: Keyframe) -> State | None:
+        """What is believed of a keyframe that has velocity and bias."""
+        estimate, v, b = self._applier.estimate, velocity_key(keyframe), bias_key(keyframe)
+        if estimate is None or not (estimate.knows(v) and estimate.knows(b)):
+            return None
+        return State(keyframe.stamp, estimate.pose(keyframe.pose), estimate.value(v), estimate.value(b))
 
     def _close(self, last: bool = False) -> list[Update]:
         """Without odometry: the measurements of one stamp are complete; their edges make the keyframes.
@@ -372,6 +457,7 @@ class Backend:
             self.origin,
             self._gauge,
             DATUM in self.solver.factors,
+            self._stretch,
         )
 
     def _takes(self, fix: Fix) -> bool:

@@ -23,9 +23,10 @@ from .firewall.covariances import (
 )
 from .firewall.repeats import Repeats
 from .firewall.rules import Fault, decided
-from .firewall.values import judge_fix, judge_pose, judge_sighting, judge_stamps
+from .firewall.values import judge_fix, judge_pose, judge_sample, judge_sighting, judge_stamps
 from .graph import Decision
-from .measurement import Measurement, StaticTransform
+from .inertial import ImuSample
+from .measurement import SECOND, Measurement, StaticTransform
 from .sensors.gnss import Fix
 from .sensors.landmark import LandmarkObservation
 from .sensors.odometry import OdometryPose
@@ -65,6 +66,7 @@ def rechecked(items: Stream, config: Config) -> Iterator[Measurement | Decision]
     """After settling: refuse duplicate and teleporting odometry, what is told in another frame, and loops told twice."""
     tracks: dict[str, Continuity] = {}
     repeats = Repeats()
+    sampled: dict[str, int] = {}  # IMU -> stamp of its newest sample
     for item in items:
         if isinstance(item, OdometryPose):
             track = tracks.get(item.source)
@@ -72,6 +74,14 @@ def rechecked(items: Stream, config: Config) -> Iterator[Measurement | Decision]
                 pace = pace_of(item.source, config)
                 track = tracks[item.source] = Continuity(pace, SPACES[config.space])
             yield from track.judge(item)
+        elif isinstance(item, ImuSample):
+            before = sampled.get(item.source, 0)
+            if item.stamp > before:
+                sampled[item.source] = item.stamp
+                yield item
+            else:
+                rule = "recheck/duplicate" if item.stamp == before else "recheck/integrated"
+                yield decided(item, "refused", rule, (before - item.stamp) / SECOND)
         elif isinstance(item, RelativePose) and repeats.told(item):
             yield decided(item, "refused", "recheck/duplicate")
         elif isinstance(item, AbsolutePose) and item.parent.strip("/") not in ("", config.map_frame):
@@ -133,6 +143,13 @@ def _capped(item: Any, source: Any) -> Any:
 
 _NOISE = {"twist": "twist_covariance", "pose": "covariance"}  # `noise` of an odometry source -> field
 
+
+def _imu(item: ImuSample, space: Space, source: Any) -> Notes:  # noqa: ARG001
+    judge_stamps(item.stamp)
+    judge_sample(item)
+    return NOTHING
+
+
 JUDGES: Mapping[type, Callable[[Any, Space, Any], Notes]] = {
     OdometryPose: _odometry,
     RelativePose: _relative,
@@ -140,4 +157,5 @@ JUDGES: Mapping[type, Callable[[Any, Space, Any], Notes]] = {
     LandmarkObservation: _landmark,
     Fix: _fix,
     StaticTransform: _static,
+    ImuSample: _imu,
 }

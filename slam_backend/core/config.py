@@ -12,7 +12,7 @@ import hashlib
 import json
 from collections.abc import Mapping, Sequence
 from difflib import get_close_matches
-from typing import Annotated, Any, Literal, get_args
+from typing import Annotated, Any, Literal, NamedTuple, get_args
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 from pydantic.fields import FieldInfo
@@ -364,8 +364,99 @@ class GnssSource(Observing):
     )
 
 
+class ImuNoise(NamedTuple):
+    """White noise (density) and random walk of the bias (walk), as an Allan variance gives them; the bias when switched on."""
+
+    gyroscope_density: float
+    gyroscope_walk: float
+    accelerometer_density: float
+    accelerometer_walk: float
+    sigma_gyroscope_bias: float
+    sigma_accelerometer_bias: float
+
+
+# Several times what data sheets say: vibration, mounting and scale come on top, and an IMU that is believed too much fights the rest.
+IMU_PRESETS: Mapping[str, ImuNoise] = {
+    "consumer": ImuNoise(2e-3, 1e-4, 2e-2, 2e-3, 5e-2, 0.5),
+    "industrial": ImuNoise(5e-4, 2e-5, 5e-3, 5e-4, 1e-2, 0.2),
+    "tactical": ImuNoise(5e-5, 2e-6, 1e-3, 5e-5, 1e-3, 0.03),
+}
+
+
+class ImuSource(Source):
+    """Angular rates and accelerations, preintegrated between keyframes; drives these where there is no odometry."""
+
+    kind: Literal["imu"] = "imu"
+    preset: Literal["consumer", "industrial", "tactical"] = Field(
+        "industrial",
+        description="noise for what is not set below. consumer: a phone's; industrial: a good MEMS; tactical: a fibre-optic gyroscope",
+    )
+    noise: Literal["preset", "message"] = Field(
+        "preset",
+        description="where densities that are not set below come from. message: its covariances, taken as those of one sample",
+    )
+    gyroscope_density: float | None = Field(
+        None, gt=0, le=10, description="rad/s/sqrt(Hz): white noise; of an Allan deviation, its value at 1 s"
+    )
+    gyroscope_walk: float | None = Field(
+        None,
+        gt=0,
+        le=10,
+        description="rad/s^2/sqrt(Hz): random walk of the bias; of an Allan deviation, the rising line's value at 3 s",
+    )
+    accelerometer_density: float | None = Field(
+        None, gt=0, le=100, description="m/s^2/sqrt(Hz): white noise; of an Allan deviation, its value at 1 s"
+    )
+    accelerometer_walk: float | None = Field(
+        None,
+        gt=0,
+        le=100,
+        description="m/s^3/sqrt(Hz): random walk of the bias; of an Allan deviation, the rising line's value at 3 s",
+    )
+    sigma_gyroscope_bias: float | None = Field(
+        None, gt=0, le=10, description="rad/s: how large the bias may be when the IMU is switched on"
+    )
+    sigma_accelerometer_bias: float | None = Field(
+        None, gt=0, le=100, description="m/s^2: how large the bias may be when the IMU is switched on"
+    )
+    gravity: float = Field(9.81, gt=0, le=100, description="m/s^2: its magnitude where the robot drives")
+    max_rate: float | None = Field(
+        None, gt=0, description="rad/s: end of the gyroscope's range; a sample there is saturated"
+    )
+    max_acceleration: float | None = Field(
+        None, gt=0, description="m/s^2: end of the accelerometer's range; a sample there is saturated"
+    )
+    max_gap: float = Field(
+        0.25, gt=0, le=60, description="seconds without a sample that are bridged; a longer silence is a gap"
+    )
+    start: Literal["auto", "rest", "motion"] = Field(
+        "auto",
+        description="rest: the robot stands still at first, so its gyroscope tells its bias; auto: by the looks of the first samples",
+    )
+    start_time: float = Field(
+        1.0,
+        gt=0,
+        le=600,
+        description="seconds of samples that tell gravity, and whether the robot stands still",
+    )
+    sigma_velocity: float = Field(
+        10.0, gt=0, le=1e4, description="m/s: how fast the robot may be where nothing else tells"
+    )
+    keyframe_time: float = Field(
+        1.0, gt=0, le=60, description="seconds between keyframes at most, where the IMU drives them"
+    )
+
+    @property
+    def stated(self) -> ImuNoise:
+        """The settings, and the preset for what is not set."""
+        given = {name: getattr(self, name) for name in ImuNoise._fields}
+        preset = IMU_PRESETS[self.preset]
+        return preset._replace(**{name: value for name, value in given.items() if value is not None})
+
+
 AnySource = Annotated[
-    OdometrySource | RelativeSource | LandmarkSource | PoseSource | GnssSource, Field(discriminator="kind")
+    OdometrySource | RelativeSource | LandmarkSource | PoseSource | GnssSource | ImuSource,
+    Field(discriminator="kind"),
 ]
 
 
@@ -459,13 +550,21 @@ class Config(Section):
         if self.space == "2d" and (self.floor.z or self.floor.tilt):
             raise ValueError("'floor' needs space: 3d; in 2d nothing leaves the plane")
         if self.sources and self.driver is None:
-            raise ValueError("no source drives the keyframes: add one of kind odometry or relative")
+            raise ValueError("no source drives the keyframes: add one of kind odometry, imu or relative")
+        imus = [name for name, source in self.sources.items() if source.kind == "imu"]
+        if imus and self.space == "2d":
+            raise ValueError(
+                f"source '{imus[0]}': an IMU needs space: 3d, since in a plane nothing tells how gravity lies; "
+                "a robot on a floor takes 3d, too"
+            )
+        if imus[1:]:
+            raise ValueError(f"source '{imus[1]}': a second IMU; '{imus[0]}' is the one that is used")
         return self
 
     @property
     def driver(self) -> str | None:
-        """The source that drives the keyframes: the first odometry, else the first relative."""
-        for kind in ("odometry", "relative"):
+        """The source that drives the keyframes: the first odometry, else the IMU, else the first relative."""
+        for kind in ("odometry", "imu", "relative"):
             for name, source in self.sources.items():
                 if source.kind == kind:
                     return name
@@ -545,7 +644,7 @@ def _one_told(first: Any, names: Sequence[str]) -> str:
     if first["type"] == "union_tag_invalid":
         what = f"there is no kind of source {first['ctx']['tag']!r}; known: {first['ctx']['expected_tags']}"
     if first["type"] == "union_tag_not_found":
-        what = "is a source, and does not say its kind: add kind: odometry, relative, landmark, pose or gnss"
+        what = "is a source, and does not say its kind: add kind: odometry, relative, landmark, pose, gnss or imu"
     if first["type"] == "extra_forbidden":
         what = f"there is no such setting{_suggest(first['loc'], names)}"
     value = first.get("input")
@@ -568,6 +667,7 @@ def _suggest(location: tuple[int | str, ...], names: Sequence[str]) -> str:
             "landmark": LandmarkSource,
             "pose": PoseSource,
             "gnss": GnssSource,
+            "imu": ImuSource,
         }
         known = set(kinds[path[-1]].model_fields) if path[-1] in kinds else set(kinds)
     elif path:

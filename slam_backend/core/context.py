@@ -8,6 +8,7 @@ import numpy as np
 
 from .config import Earth
 from .graph import Decision, Delta, Estimate, Factor, Motion, Offer, Pose, Wait
+from .inertial import Stretch
 from .keyframes import Placed
 from .measurement import Array
 from .mounts import Mounts
@@ -26,6 +27,7 @@ class Context:
     origin: latitude, longitude, altitude; None before the first fix.
     gauge: key -> id of the factor that holds its component and may be replaced; None where something else holds it, or will.
     has_datum: the earth stays where it is in the map.
+    stretch: what the IMU measured from the keyframe before to this one.
     """
 
     space: Space
@@ -41,6 +43,7 @@ class Context:
     origin: Sequence[float] | None = None
     gauge: Callable[[int], str | None] = lambda _: None
     has_datum: bool = False
+    stretch: Stretch | None = None
 
     def known(self, key: int) -> bool:
         """Whether a variable is in the graph, or about to enter."""
@@ -73,10 +76,13 @@ class Context:
         """`base_T_frame`: the space's own identity object for the base itself; Unusable for an unknown frame."""
         mount = self.mounts.get(frame)
         if mount is None:
-            raise Unusable(
-                "unknown_frame", f"where is '{frame}' on the robot? add it to 'extrinsics' or send /tf_static"
-            )
+            raise unknown_frame(frame)
         return mount
+
+
+def unknown_frame(frame: str) -> "Unusable":
+    what = f"where is '{frame}' on the robot? add it to 'extrinsics' or send /tf_static"
+    return Unusable("unknown_frame", what)
 
 
 class Unusable(Exception):  # never leaves the sensors: how one says that a measurement makes no factor

@@ -22,7 +22,7 @@ from .settle import FAR
 
 Out = Literal["disabled", "removed"]
 EVERY = "all"
-UNMEANT = frozenset({"motion", "odometry", "floor"})  # kinds that it does not mean
+UNMEANT = frozenset({"motion", "odometry", "imu", "floor"})  # kinds that it does not mean
 FACTORS = "a factor's id, a source, 'all', or one of these with @<from>,<to>"
 
 

@@ -54,9 +54,10 @@ class Factor:
     """A GTSAM factor and where it came from; the id is the same in every replay.
 
     id: `<source>/<stamp>/<n>`, n counting the measurements of that source with that stamp.
-    kind: motion (it made a keyframe), odometry (beside that), loop, landmark, pose, floor, gnss, earth, datum or gauge; what reports, robust stages and
-    exports sort by.
+    kind: motion (it made a keyframe), odometry (beside that), loop, landmark, pose, imu, floor, gnss, earth, datum or gauge; what
+    reports, robust stages and exports sort by.
     stamp: of the measurement; stamps: of its two ends, for relative measurements.
+    motion: between its first pose and its last, where the factor itself has more variables than these.
     """
 
     id: str
@@ -65,6 +66,7 @@ class Factor:
     keys: tuple[int, ...]
     stamp: int
     stamps: tuple[int, int] | None = None
+    motion: "Motion | None" = None
 
     @property
     def source(self) -> str:

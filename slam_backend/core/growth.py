@@ -3,6 +3,8 @@
 from collections.abc import Callable, Mapping
 from typing import Any
 
+import numpy as np
+
 from .context import Context, Unusable
 from .graph import Delta, Factor, Keyframe, Offer, Pose, keyframe, total
 from .keyframes import Timeline, Track
@@ -15,11 +17,16 @@ from .space import Space
 from .waiting import refusal
 
 GAUGE_SIGMA = 1e-3  # m and rad; of the prior that fixes a part of the graph in space
+TILT = 0.5  # rad; of roll and pitch in it where an IMU tells them
 
 
-def gauge(space: Space, key: int, stamp: int, pose: Pose) -> Factor:
-    """Holds a part of the graph where this pose of it is."""
-    noise = noise_of(space.diagonal(GAUGE_SIGMA**2, GAUGE_SIGMA**2))
+def gauge(space: Space, key: int, stamp: int, pose: Pose, tilt: float = GAUGE_SIGMA) -> Factor:
+    """Holds a part of the graph where this pose of it is. tilt: rad, of roll and pitch, where gravity tells these (3-D only)."""
+    covariance = space.diagonal(GAUGE_SIGMA**2, GAUGE_SIGMA**2)
+    if tilt != GAUGE_SIGMA:
+        map_R_child = pose.rotation().matrix()
+        covariance[:3, :3] = map_R_child.T @ np.diag([tilt**2, tilt**2, GAUGE_SIGMA**2]) @ map_R_child
+    noise = noise_of(covariance)
     name = f"gauge/{format_stamp(stamp)}/0"
     return Factor(name, "gauge", space.prior(key, pose, noise), (key,), stamp)
 
@@ -31,10 +38,11 @@ class Growth:
         self._space, self._timeline, self._track, self._parts = space, timeline, track, parts
         self.begins = 0  # the newest stamp of earlier sessions, whose keyframes are complete
 
-    def start(self, stamp: int) -> tuple[Keyframe, Delta]:
-        """A part of its own: its first pose is the origin, until something absolute says otherwise."""
-        first, origin = self._added(stamp), self._space.identity
-        factor = gauge(self._space, first.pose, stamp, origin)
+    def start(self, stamp: int, level: Pose | None = None) -> tuple[Keyframe, Delta]:
+        """A part of its own: its first pose is the origin, until something absolute says otherwise. level: as gravity turns it."""
+        first, origin = self._added(stamp), self._space.identity if level is None else level
+        tilt = GAUGE_SIGMA if level is None else TILT
+        factor = gauge(self._space, first.pose, stamp, origin, tilt)
         self._parts.begin(first.pose, factor.id)
         return first, Delta((factor,), values={first.pose: origin})
 

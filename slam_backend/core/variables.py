@@ -13,6 +13,8 @@ from typing import Any, NamedTuple
 
 import gtsam
 import numpy as np
+from gtsam import symbolIndex
+from gtsam.symbol_shorthand import X
 
 from .graph import Pose
 from .space import Space
@@ -71,6 +73,11 @@ _BY_CODE = {ord(letter): kind for letter, kind in KINDS.items()}
 
 def kind_of(key: int) -> Kind:
     return _BY_CODE[key >> 56]  # gtsam keeps a symbol's letter in the top byte
+
+
+def pose_beside(key: int) -> int:
+    """Of a velocity or a bias, the pose of the keyframe that has it; of anything else, the variable itself."""
+    return int(X(symbolIndex(key))) if kind_of(key) in (VELOCITY, BIAS) else key
 
 
 def is_posed(key: int) -> bool:

@@ -18,6 +18,7 @@ from ..core import command
 from ..core.errors import BadMessage
 from ..core.firewall.rules import OVERSIZE, RULES
 from ..core.graph import Decision
+from ..core.inertial import ImuSample
 from ..core.measurement import SECOND, Array, Measurement, parse_frame
 from ..core.sensors import SENSORS
 from ..core.sensors.odometry import STILL, UNKNOWN, OdometryPose
@@ -100,6 +101,12 @@ def _pose(data: bytes, source: str, names: _Names) -> OdometryPose:
     return OdometryPose(stamp, source, frame, "", n, UNKNOWN, STILL, UNKNOWN)
 
 
+def _imu(data: bytes, source: str, names: _Names) -> ImuSample:
+    """sensor_msgs/msg/Imu: orientation 4, covariance 9, angular velocity 3, covariance 9, acceleration 3, covariance 9."""
+    stamp, (frame,), n = _read(data, 37, names)
+    return ImuSample(stamp, source, frame, n[13:16], n[25:28], n[16:25], n[28:])
+
+
 def _relative(data: bytes, source: str, names: _Names) -> RelativePose:
     """nav_msgs/msg/Odometry whose frames name two moments."""
     told = _odometry(data, source, names)
@@ -117,6 +124,7 @@ _FAST: Mapping[tuple[str, str], tuple[_Fast, int]] = {  # (kind, type) -> the sh
     ("odometry", "geometry_msgs/msg/PoseWithCovarianceStamped"): (_pose_with_covariance, 1),
     ("odometry", "geometry_msgs/msg/PoseStamped"): (_pose, 1),
     ("relative", "nav_msgs/msg/Odometry"): (_relative, 2),
+    ("imu", "sensor_msgs/msg/Imu"): (_imu, 1),
 }
 
 

@@ -103,6 +103,23 @@ def encode_odometry(
     return message.finish()
 
 
+def encode_imu(
+    stamp: int,
+    frame: str,
+    rate: ArrayLike,
+    acceleration: ArrayLike,
+    rate_covariance: ArrayLike,
+    acceleration_covariance: ArrayLike,
+) -> bytes:
+    """sensor_msgs/msg/Imu without an orientation. rate: rad/s, acceleration: m/s^2; covariances (9,) row by row."""
+    message = _Bytes()
+    message.header(stamp, frame)
+    message.doubles((0, 0, 0, 1, -1, *[0] * 8), 13)  # -1: there is none
+    for values, count in ((rate, 3), (rate_covariance, 9), (acceleration, 3), (acceleration_covariance, 9)):
+        message.doubles(values, count)
+    return message.finish()
+
+
 def encode_pose_with_covariance(stamp: int, frame: str, seven: ArrayLike, covariance: ArrayLike) -> bytes:
     """geometry_msgs/msg/PoseWithCovarianceStamped."""
     message = _Bytes()

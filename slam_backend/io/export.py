@@ -34,22 +34,27 @@ def pose_graph(result: Result) -> PoseGraph:
         "2d" if space.name == "2d" else "3d",
         np.array(sorted(ids), dtype=np.uint64),
         states,
-        Edges(
-            *_links(
-                by_kind["edges"], rank, rank, lambda f: (_state(space, f.measured()), _information(f)), space
-            )
-        ),
+        Edges(*_links(by_kind["edges"], rank, rank, lambda f: _edge(space, f), space)),
         stamps=np.array([keyframes[n].stamp for n in order], dtype=np.int64),
         landmarks=np.arange(len(landmark_rank), dtype=np.uint64),
         positions=result.snapshot.landmarks[:, :dimension],
         sightings=Sightings(
             *_links(
-                by_kind["sightings"], rank, landmark_rank, lambda f: _sighting(space, f), space, dimension
+                by_kind["sightings"],
+                rank,
+                landmark_rank,
+                lambda f: _sighting(space, f.factor),
+                space,
+                dimension,
             )
         ),
         priors=Priors(
             *_links(
-                by_kind["priors"], rank, rank, lambda f: (_state(space, f.prior()), _information(f)), space
+                by_kind["priors"],
+                rank,
+                rank,
+                lambda f: (_state(space, f.factor.prior()), _information(f.factor)),
+                space,
             )
         ),
     )
@@ -67,10 +72,11 @@ def _links(
     """(i, j, states, information) as Links takes them."""
     width = size or len(_state(space, space.identity))
     depth = size or space.dimension
-    rows = [measured(factor.factor) for factor in factors]
+    rows = [measured(factor) for factor in factors]
+    ends = [[key for key in factor.keys if key in first or key in second] for factor in factors]
     return (
-        np.array([first[factor.keys[0]] for factor in factors], dtype=np.int64),
-        np.array([second[factor.keys[-1]] for factor in factors], dtype=np.int64),
+        np.array([first[each[0]] for each in ends], dtype=np.int64),
+        np.array([second[each[-1]] for each in ends], dtype=np.int64),
         np.array([row[0] for row in rows]).reshape(-1, width),
         np.array([row[1] for row in rows]).reshape(-1, depth, depth),
     )
@@ -78,6 +84,13 @@ def _links(
 
 def _state(space: Space, pose: Any) -> tuple[float, ...]:
     return space.numbers(pose) if space.name == "2d" else space.seven(pose)
+
+
+def _edge(space: Space, factor: Factor) -> tuple[tuple[float, ...], Array]:
+    """What was measured, and its information. No format has velocities and biases: of an IMU the motion as it was predicted."""
+    if factor.motion is not None:
+        return _state(space, factor.motion.pose), np.asarray(np.linalg.inv(factor.motion.covariance))
+    return _state(space, factor.factor.measured()), _information(factor.factor)
 
 
 def _information(factor: Any) -> Array:

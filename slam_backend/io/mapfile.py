@@ -3,6 +3,7 @@
     version, space, revision, run_hash
     graph, values                   bytes: the kept factors and every variable, as gtsam itself writes them
     ids, kinds, stamps, ends        (F,) of the factors, in the same order; ends (F, 2), -1: none
+    moving, motions, spreads        (M,) factors with a motion beside them, its numbers (M, k) and its covariance (M, d, d)
     keyframe_stamps                 (K,) by index
     names, name_keys                (L,) of the landmarks
     keys, parts                     (V,) the component of each variable
@@ -23,7 +24,7 @@ import gtsam
 import numpy as np
 
 from ..core.errors import BadFile
-from ..core.graph import Factor, keyframe
+from ..core.graph import Factor, Motion, keyframe
 from ..core.keyframes import Samples
 from ..core.sessions import SavedMap
 from ..core.space import SPACES
@@ -48,6 +49,7 @@ def write_map(path: Path, saved: SavedMap) -> None:
         kinds=_texts(factor.kind for factor in saved.factors),
         stamps=_integers(factor.stamp for factor in saved.factors),
         ends=_integers(stamp for factor in saved.factors for stamp in factor.stamps or (-1, -1)).reshape(-1, 2),
+        **_motions(saved),
         keyframe_stamps=_integers(stamps),
         names=_texts(saved.landmarks), name_keys=_keys(saved.landmarks.values()),
         keys=_keys(saved.parts), parts=_keys(saved.parts.values()),
@@ -105,15 +107,16 @@ def _map(arrays: dict[str, Any]) -> SavedMap:
         strict=True,
     )
     factors = []
+    space = SPACES[str(arrays["space"])]
+    moving = zip(arrays["moving"].tolist(), arrays["motions"].tolist(), arrays["spreads"], strict=True)
+    motions = {n: Motion(space.pose_of_numbers(numbers), spread) for n, numbers, spread in moving}
     for n, (id_, kind, stamp, ends) in enumerate(rows):
         factor = graph.at(n)
-        factors.append(
-            Factor(id_, kind, factor, tuple(factor.keys()), stamp, None if ends[0] < 0 else tuple(ends))
-        )
+        stamps = None if ends[0] < 0 else tuple(ends)
+        factors.append(Factor(id_, kind, factor, tuple(factor.keys()), stamp, stamps, motions.get(n)))
     parts = dict(zip(arrays["keys"].tolist(), arrays["parts"].tolist(), strict=True))
     if set(parts) != set(values.keys()) or not parts:
         raise ValueError("its variables do not fit its factors")
-    space = SPACES[str(arrays["space"])]
     seen = gtsam.Values()
     seen.deserialize(_unpacked(arrays["seen_at"]))
     sighted = zip(arrays["seen"].tolist(), arrays["seen_from"].tolist(), strict=True)
@@ -125,6 +128,17 @@ def _map(arrays: dict[str, Any]) -> SavedMap:
         _tracks(arrays), Trajectory(arrays["online_stamps"], arrays["online_sevens"]),
         int(arrays["revision"]), str(arrays["run_hash"]),
     )  # fmt: skip
+
+
+def _motions(saved: SavedMap) -> dict[str, Any]:
+    space = SPACES[saved.space]
+    found = [(n, f.motion) for n, f in enumerate(saved.factors) if f.motion is not None]
+    size = space.dimension
+    return {
+        "moving": _integers(n for n, _ in found),
+        "motions": np.array([space.numbers(motion.pose) for _, motion in found]),
+        "spreads": np.array([motion.covariance for _, motion in found]).reshape(-1, size, size),
+    }
 
 
 def _tracks(arrays: dict[str, Any]) -> tuple[Samples, ...]:

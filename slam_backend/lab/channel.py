@@ -5,13 +5,14 @@ from typing import NamedTuple
 
 from numpy.random import Generator
 
+from ..core.inertial import ImuSample
 from ..core.measurement import SECOND, Measurement
 from ..core.sensors.landmark import LandmarkObservation
 from ..core.sensors.odometry import OdometryPose
 from ..core.sensors.relative import RelativePose
 from .options import Options
 
-Content = OdometryPose | RelativePose | tuple[LandmarkObservation, ...]
+Content = OdometryPose | RelativePose | ImuSample | tuple[LandmarkObservation, ...]
 ECHO = 1_000_000  # ns from a message to its duplicate
 
 

@@ -29,6 +29,13 @@ class Options:
     landmarks: int | None = None  # how many there are; None: as many as the scenario has
     landmark_range: float = 8.0  # m: how far they are seen
     landmark_sigma: float = 0.1  # m, on each axis
+    imu_rate: float = 0.0  # samples per second of an IMU at the base; 0: it has none
+    gyroscope_density: float = 5e-4  # rad/s/sqrt(Hz), white noise
+    gyroscope_walk: float = 2e-5  # rad/s^2/sqrt(Hz), of its bias
+    gyroscope_bias: float = 5e-3  # rad/s, standard deviation when switched on
+    accelerometer_density: float = 5e-3  # m/s^2/sqrt(Hz), white noise
+    accelerometer_walk: float = 5e-4  # m/s^3/sqrt(Hz), of its bias
+    accelerometer_bias: float = 0.05  # m/s^2, standard deviation when switched on
     dropout: float = 0.0  # fraction of the messages that never arrive
     silence_start: float = 0.0  # s after the start: nothing that is stamped from here ...
     silence: float = 0.0  # ... for this many seconds arrives
@@ -46,8 +53,22 @@ class Options:
                 raise BadConfig(f"{field.name}: is a fraction and must not exceed 1 (it says {value})")
         if self.poses < 2:
             raise BadConfig(f"poses: a drive needs at least 2 (it says {self.poses})")
+        if 0 < self.imu_rate < 1 / self.period:
+            raise BadConfig(
+                f"imu_rate: must be at least that of the poses, {1 / self.period:g} Hz (it says {self.imu_rate})"
+            )
         if self.period < 1e-6:
             raise BadConfig(f"period: must be at least 1e-6 s (it says {self.period})")
-        for name in ("loop_sigma_translation", "loop_sigma_rotation", "landmark_sigma"):
+        for name in (
+            "loop_sigma_translation",
+            "loop_sigma_rotation",
+            "landmark_sigma",
+            "gyroscope_density",
+            "gyroscope_walk",
+            "gyroscope_bias",
+            "accelerometer_density",
+            "accelerometer_walk",
+            "accelerometer_bias",
+        ):
             if getattr(self, name) == 0:
                 raise BadConfig(f"{name}: must be greater than 0")

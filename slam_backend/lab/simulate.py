@@ -3,6 +3,7 @@
 from collections import Counter
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from itertools import chain as chain_of
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -14,24 +15,27 @@ from numpy.typing import NDArray
 from ..core.config import config_from
 from ..core.errors import BadConfig
 from ..core.geometry import inverse_of, seven_of_matrix
+from ..core.inertial import ImuSample
 from ..core.measurement import SECOND, Array, Measurement, format_stamp, frozen
 from ..core.sensors.odometry import STILL, UNKNOWN, OdometryPose
 from ..core.sensors.relative import RelativePose
 from ..io.bags import write_bag
-from ..io.encode import encode_cloud, encode_odometry, encode_transforms
+from ..io.encode import encode_cloud, encode_imu, encode_odometry, encode_transforms
 from ..io.formats import tum
 from ..io.formats.trajectory import Trajectory
 from ..io.records import Record
 from . import sensing
 from .channel import Sent, delivered, in_order
+from .inertia import imu_messages
 from .options import Options
 from .world import SCENARIOS, Scenario, chain, exp_of
 
 __all__ = ["SCENARIOS", "Options", "Simulation", "Written", "simulate", "write_simulation"]
 
 START = 1_700_000_000 * SECOND
-ODOMETRY, CLOUD = "nav_msgs/msg/Odometry", "sensor_msgs/msg/PointCloud2"
-LATENCY = {"/truth": 0, "/odom": 1_000_000, "/loops": 5_000_000, "/landmarks": 50_000_000}  # ns
+ODOMETRY, CLOUD, IMU = "nav_msgs/msg/Odometry", "sensor_msgs/msg/PointCloud2", "sensor_msgs/msg/Imu"
+PARTS = ("gyroscope", "accelerometer")
+LATENCY = {"/truth": 0, "/odom": 1_000_000, "/loops": 5_000_000, "/landmarks": 50_000_000, "/imu": 0}  # ns
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -77,13 +81,16 @@ def simulate(scenario: str, seed: int = 0, options: Options = Options()) -> Simu
         raise BadConfig(f"there is no scenario '{scenario}'; known: {', '.join(SCENARIOS)}")
     world = SCENARIOS[scenario]
     # One stream for each cause of chance: a change of the loops leaves the odometry as it was.
-    *chances, for_channel = np.random.default_rng(seed).spawn(7)
+    *chances, for_channel, for_imu = np.random.default_rng(seed).spawn(8)
     truth = chain(exp_of(world.path(options.poses, chances[0])))
     count = world.landmarks if options.landmarks is None else options.landmarks
     landmarks = world.place(truth, count, chances[1])
     loops = tuple(sensing.find_loops(truth, options, chances[2]))
     stamps = [START + k * round(options.period * SECOND) for k in range(options.poses)]
     messages = _messages(world, truth, landmarks, loops, stamps, options, chances[3:])
+    if options.imu_rate:
+        samples = imu_messages(truth, stamps, options, sensing.BASE, for_imu)
+        messages = chain_of(messages, (_sent("/imu", sample) for sample in samples))
     lost: Counter[str] = Counter()
 
     def counted(what: str) -> None:
@@ -113,7 +120,7 @@ def _messages(
         yield Sent(seen[0].stamp + LATENCY["/landmarks"], "/landmarks", seen)
 
 
-def _sent(topic: str, item: OdometryPose | RelativePose) -> Sent:
+def _sent(topic: str, item: OdometryPose | RelativePose | ImuSample) -> Sent:
     return Sent(item.stamp + LATENCY[topic], topic, item)
 
 
@@ -133,6 +140,9 @@ def _record(sent: Sent) -> Record:
         columns["sigma"] = np.sqrt([seen.covariance[0, 0] for seen in item])
         data = encode_cloud(item[0].stamp, item[0].frame, columns)
         return Record(sent.topic, CLOUD, sent.arrival, data)
+    if isinstance(item, ImuSample):
+        felt = (item.rate, item.acceleration, item.rate_covariance, item.acceleration_covariance)
+        return Record(sent.topic, IMU, sent.arrival, encode_imu(item.stamp, item.frame, *felt))
     if isinstance(item, OdometryPose):
         frames, noise = (item.frame, item.child), (item.covariance, item.twist, item.twist_covariance)
     else:
@@ -159,10 +169,18 @@ def _settings(world: Scenario, options: Options, topics: set[str]) -> dict[str, 
             "sigma_rotation": options.loop_sigma_rotation,
         },
         "landmarks": {"kind": "landmark", "topic": "/landmarks", "sigma_position": options.landmark_sigma},
+        "imu": {"kind": "imu", "topic": "/imu"}
+        | {
+            f"{part}_{what}": getattr(options, f"{part}_{what}")
+            for part in PARTS
+            for what in ("density", "walk")
+        }
+        | {f"sigma_{part}_bias": getattr(options, f"{part}_bias") for part in PARTS},
     }
     present = {name: source for name, source in sources.items() if source["topic"] in topics}
     extrinsics = {} if world.camera is None else {"extrinsics": {sensing.CAMERA: list(world.camera)}}
-    head = {"space": world.space, "base_frame": sensing.BASE, "keyframes": {"every": True}}
+    space = "3d" if "/imu" in topics else world.space
+    head = {"space": space, "base_frame": sensing.BASE, "keyframes": {"every": True}}
     settings = {**head, **extrinsics, "sources": list(present), **present}
     config_from(settings)  # options that no configuration can say are refused here, not at the replay
     return settings

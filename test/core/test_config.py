@@ -96,7 +96,9 @@ def test_the_first_odometry_drives_else_the_first_relative(kinds, driver):
 
 
 def test_sources_without_a_driver_are_refused():
-    assert "add one of kind odometry or relative" in complaint({"sources": ["a"], "a": {"kind": "landmark"}})
+    assert "add one of kind odometry, imu or relative" in complaint(
+        {"sources": ["a"], "a": {"kind": "landmark"}}
+    )
 
 
 # -- mistakes ----------------------------------------------------------------------------------------------------

@@ -17,6 +17,7 @@ LATEST = 1 << 31  # s since 1970
 FARTHEST = 1e9  # m; beyond, double precision has no micrometres left
 QUATERNION_TOLERANCE = 0.1  # of the squared norm; less is normalized
 ABSURD_VARIANCE = 1e12  # m^2 or rad^2 on every used axis: a way to say "unknown"; no factor can come of it
+VIOLENT = 1e4  # rad/s or m/s^2: no IMU measures so much
 TINY_VARIANCE = 1e-18  # m^2 or rad^2: a sigma of a nanometre; what an integer in a float64 field looks like
 ASYMMETRY = 1e-6  # relative to the largest entry
 ACCELERATION = 20.0  # m/s^2 by which a speed that an odometry states may be outdone
@@ -106,6 +107,34 @@ RULES: Mapping[str, Rule] = {
     "recheck/restart": Rule(
         "warn", "the odometry jumped and stayed there: a new epoch; across the jump it measures nothing",
         "find out why the odometry was reset", _DEFAULTS[0].max_speed, "m/s", "<odometry>.max_speed",
+    ),
+    # -- IMU -----------------------------------------------------------------------------------------------------
+    "recheck/integrated": Rule(
+        "warn", "an IMU sample older than one that has been integrated", "raise settle.lag, or send samples in order", 0.0, "s",
+        "settle.lag",
+    ),
+    "imu/gap": Rule(
+        "warn", "the IMU was silent, or a stretch of it was lost; velocity and bias go on without it",
+        "look for lost messages; max_gap says what is bridged", unit="s", setting="<imu>.max_gap",
+    ),
+    "imu/saturated": Rule(
+        "warn", "the IMU reached the end of its range; the stretch is not used", "damp the mounting, or set a larger range", unit="s"
+    ),
+    "imu/gravity": Rule(
+        "error", "at the start the mean acceleration is nothing like gravity",
+        "accelerations must be in m/s^2 and include gravity (at rest 9.81 upwards)", unit="m/s^2", setting="<imu>.gravity",
+    ),
+    "imu/sideways": Rule(
+        "warn", "gravity says that the robot lies on its side: is the IMU mounted so?",
+        "tell its mounting: add its frame to 'extrinsics' or send it on /tf_static", unit="rad",
+    ),
+    "imu/at_rest": Rule(
+        "note", "the robot stands still at first: the gyroscope's bias is its mean", "if it does not, say start: motion", unit="s",
+        setting="<imu>.start",
+    ),
+    "imu/in_motion": Rule(
+        "note", "the robot moves at first: velocity and bias come from other sensors", "standing still for a second tells more", unit="s",
+        setting="<imu>.start",
     ),
     # -- covariances: only the block that the space uses ---------------------------------------------------------
     "check/zero_covariance": Rule(

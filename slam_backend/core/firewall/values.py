@@ -4,11 +4,12 @@ from math import isfinite
 
 import numpy as np
 
+from ..inertial import ImuSample
 from ..measurement import SECOND, Array
 from ..sensors.gnss import Fix
 from ..sensors.landmark import FORMS, LandmarkObservation, vertical
 from ..space import Space
-from .rules import FARTHEST, LATEST, QUATERNION_TOLERANCE, Fault
+from .rules import FARTHEST, LATEST, QUATERNION_TOLERANCE, VIOLENT, Fault
 
 
 def judge_stamps(*stamps: int) -> None:
@@ -29,6 +30,13 @@ def judge_pose(seven: Array, space: Space) -> None:
         raise Fault("not_finite")
     if abs(square - 1) > QUATERNION_TOLERANCE:
         raise Fault("quaternion", square)
+
+
+def judge_sample(item: ImuSample) -> None:
+    """Rates and accelerations that a robot can have."""
+    numbers = (*item.rate.tolist(), *item.acceleration.tolist())
+    if not max(map(abs, numbers)) < VIOLENT or not isfinite(sum(numbers)):
+        raise Fault("not_finite")
 
 
 def judge_sighting(item: LandmarkObservation, space: Space) -> tuple[int, ...]:

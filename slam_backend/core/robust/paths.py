@@ -225,7 +225,7 @@ class Paths:
         self._chains.append(Chain(self.space.identity, self._zero))
 
     def _extend(self, factor: Factor) -> None:
-        a, b = factor.keys
+        a, b = (key for key in factor.keys if is_pose(key))
         motion = motion_of(factor)
         if b in self._points:
             a, b, motion = b, a, motion.inverse()
@@ -358,6 +358,8 @@ def _joined(path: Path | None, further: Path | None) -> Path:
 
 def motion_of(factor: Factor) -> Motion:
     """What a between factor measured, with the covariance of the noise inside a robust kernel."""
+    if factor.motion is not None:
+        return factor.motion
     noise = factor.factor.noiseModel()
     inner = noise.noise() if hasattr(noise, "noise") else noise
     return Motion(factor.factor.measured(), np.asarray(inner.covariance()))

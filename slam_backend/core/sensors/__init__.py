@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 from ..context import Context
 from ..graph import Delta, Keyframe, Offer
 from ..measurement import Decoder
-from . import gnss, landmark, odometry, pose, relative, static
+from . import gnss, imu, landmark, odometry, pose, relative, static
 
 
 class Sensor(NamedTuple):
@@ -26,5 +26,6 @@ SENSORS: Mapping[str, Sensor] = {
     "landmark": Sensor(landmark.DECODERS, landmark.factors),
     "gnss": Sensor(gnss.DECODERS, gnss.factors),
     "pose": Sensor(pose.DECODERS, pose.factors),
+    "imu": Sensor(imu.DECODERS, imu.factors),
     "static": Sensor(static.DECODERS, static.factors),
 }
