@@ -170,13 +170,8 @@ class Backend:
             return []
         if isinstance(measurement, Command):
             return self._carry_out(measurement)
-        if isinstance(measurement, OdometryPose) and measurement.source == self._driver:
-            return self._drive(measurement)
-        if isinstance(measurement, OdometryPose) and measurement.source in self._beside:
-            self._decisions += self._beside[measurement.source].add(measurement, bool(self._newest))
-            return []
-        if isinstance(measurement, ImuSample) and self._inertial and measurement.source == self._imu:
-            return self._sample(measurement, self._inertial)
+        if (updates := self._flows(measurement)) is not None:
+            return updates
         if self._relative and isinstance(measurement, RelativePose) and measurement.source == self._driver:
             self._mounts.name_base(measurement.frame_j)
         if isinstance(measurement, Fix) and not self._takes(measurement):
@@ -287,6 +282,17 @@ class Backend:
         return values
 
     # -- the way of a measurement ----------------------------------------------------------------
+
+    def _flows(self, measurement: Measurement) -> list[Update] | None:
+        """Odometry and the IMU flow: added up until the next keyframe, not kept one by one. None: it is something else."""
+        if isinstance(measurement, OdometryPose) and measurement.source == self._driver:
+            return self._drive(measurement)
+        if isinstance(measurement, OdometryPose) and measurement.source in self._beside:
+            self._decisions += self._beside[measurement.source].add(measurement, bool(self._newest))
+            return []
+        if isinstance(measurement, ImuSample) and self._inertial and measurement.source == self._imu:
+            return self._sample(measurement, self._inertial)
+        return None
 
     def _drive(self, odometry: OdometryPose) -> list[Update]:
         """The driving odometry moves on: keyframes that were asked for, then one of its own if it is due."""
