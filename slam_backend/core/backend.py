@@ -11,6 +11,7 @@ from gtsam import symbolIndex
 
 from .adopted import Adopted
 from .apply import Applier, touched, without
+from .association import Associator
 from .beside import Beside
 from .command import Command
 from .config import Config, GnssSource, LandmarkSource, OdometrySource, PoseSource, RelativeSource
@@ -126,6 +127,11 @@ class Backend:
         }
         self._epoch, self._origin = 0, HERE  # of the driving odometry
         self._landmarks: dict[str, int] = {}
+        self._associators = {
+            name: Associator(name, source, space)
+            for name, source in config.sources.items()
+            if isinstance(source, LandmarkSource)
+        }
         self._waiting = Waiting(config)
         self._is_complete = False  # nothing was offered since the last keyframes along edges were made
         self._growth = Growth(space, self.timeline, self.track, self.parts)
@@ -148,6 +154,8 @@ class Backend:
         for each in saved.keyframes:
             self.timeline.add(each)
         self._landmarks |= saved.landmarks
+        for associator in self._associators.values():
+            associator.restore(saved.landmarks)
         noise = self.track.noise
         self.tracks.before([Track(self.space, noise).restore(each) for each in saved.tracks])
         self._waiting.remember(factor.id for factor in saved.factors if factor.kind != "gauge")
@@ -443,8 +451,11 @@ class Backend:
         deltas: list[Delta] = []
         for name, source in self.config.sources.items():
             if name in by_source:
-                context = self._context(guesses)
-                deltas.append(SENSORS[source.kind].factors(by_source[name], a, b, context, source))
+                context, offers = self._context(guesses), by_source[name]
+                if associator := self._associators.get(name):
+                    offers, decisions = associator.named(offers, a, b, context)
+                    self._decisions += decisions
+                deltas.append(SENSORS[source.kind].factors(offers, a, b, context, source))
                 guesses = {**guesses, **deltas[-1].values}  # what one has found is there for the next
         return total(deltas)
 

@@ -302,7 +302,7 @@ class RelativeSource(Observing):
 
 
 class LandmarkSource(Observing):
-    """Observations of landmarks with known ids."""
+    """Observations of landmarks, with ids or without."""
 
     kind: Literal["landmark"] = "landmark"
     frame: str = Field(
@@ -311,6 +311,30 @@ class LandmarkSource(Observing):
     )
     range_scale: float = Field(
         1.0, gt=0.1, lt=10, description="how many times too long its ranges are; they are divided by it"
+    )
+    association: Literal["joint", "nearest"] = Field(
+        default="joint",
+        description="how a sighting without an id finds its landmark. joint: the largest set of pairs that are compatible together "
+        "(JCBB: Neira & Tardos, 2001); nearest: the closest pairs, each by itself",
+    )
+    ignore_ids: bool = Field(
+        default=False, description="ids in messages mean nothing: sightings are associated"
+    )
+    gate: float = Field(
+        0.99,
+        gt=0,
+        lt=1,
+        description="probability with which a true pair of sighting and landmark passes (chi-square)",
+    )
+    confirmations: int = Field(
+        2, ge=1, le=100, description="sightings without an id that make a landmark; until then they wait"
+    )
+    search: float = Field(
+        10.0,
+        ge=0,
+        le=1e6,
+        description="m around a sighting in which its landmark is looked for, and by which a consensus of sightings may correct the "
+        "pose where fewer than half find their landmark",
     )
     sigma_position: float = Field(
         0.1, gt=0, le=1e6, description="m, for positions without noise of their own"

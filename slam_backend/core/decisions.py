@@ -10,7 +10,19 @@ from .measurement import SECOND, format_stamp
 
 # stages that a flood of bad messages can fill
 ABOUT_RECORDS = frozenset(
-    {"decode", "check", "settle", "recheck", "landmark", "odometry", "pose", "gnss", "imu", "session"}
+    {
+        "decode",
+        "check",
+        "settle",
+        "recheck",
+        "landmark",
+        "odometry",
+        "pose",
+        "gnss",
+        "imu",
+        "session",
+        "association",
+    }
 )
 
 EVERYDAY = ("doubt", "expected")  # a fix that is where it should be: ten a second, for days

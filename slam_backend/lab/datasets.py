@@ -1,4 +1,4 @@
-"""Public data sets that come inside gtsam's wheel, as bags.
+"""Public data sets as bags: those inside gtsam's wheel, and others from a folder of their files (RECORDINGS).
 
 What the files leave unsaid, and how it is read here:
 
@@ -40,7 +40,7 @@ from ..io.encode import encode_cloud, encode_odometry
 from ..io.formats import tum
 from ..io.formats.trajectory import Trajectory
 from ..io.records import Record
-from . import pose_graphs
+from . import mrclam, pose_graphs, victoria_raw
 from .gtsam_data import Content, example, lifted, planar, rows, symmetric
 from .matlab import read_arrays
 from .simulate import CLOUD, ODOMETRY, START, beside
@@ -56,6 +56,14 @@ class Dataset:
     read: Callable[[], Content]
 
 
+@dataclass(frozen=True, slots=True)
+class Recording:
+    """A data set that gtsam does not bring: from a folder of its own files."""
+
+    description: str
+    read: Callable[[Path], Content]
+
+
 class Made(NamedTuple):
     """What was written: `seconds` from the first to the last message; `truth` as TUM where there is one."""
 
@@ -66,11 +74,14 @@ class Made(NamedTuple):
     truth: Path | None = None
 
 
-def make_dataset(name: str, out: Path, advance: Callable[[int], None] = lambda _: None) -> Made:
-    """Write one of DATASETS as a bag at `out`; `advance` hears of every message. BadConfig for another name."""
-    if name not in DATASETS:
-        raise BadConfig(f"there is no data set '{name}'; known: {', '.join(DATASETS)}")
-    content = DATASETS[name].read()
+def make_dataset(
+    name: str, out: Path, advance: Callable[[int], None] = lambda _: None, folder: Path | None = None
+) -> Made:
+    """Write one of DATASETS, or one of RECORDINGS from its folder, as a bag at `out`; `advance` hears of every message.
+
+    BadConfig for another name, or where the folder is missing or of no use; BadFile for what is wrong in it.
+    """
+    content = _content(name, folder)
     records = sorted(content.records, key=lambda record: record.log_time)
     write_bag(out, _counted(records, advance))
     truth = None
@@ -78,7 +89,20 @@ def make_dataset(name: str, out: Path, advance: Callable[[int], None] = lambda _
         truth = beside(out, ".truth.tum")
         tum.write(truth, content.truth)
     seconds = (records[-1].log_time - records[0].log_time) / SECOND
-    return Made(out, len(records), DATASETS[name].description, seconds, truth)
+    known = RECORDINGS[name] if name in RECORDINGS else DATASETS[name]
+    return Made(out, len(records), known.description, seconds, truth)
+
+
+def _content(name: str, folder: Path | None) -> Content:
+    if name in RECORDINGS:
+        if folder is None:
+            raise BadConfig(f"'{name}' does not come with gtsam: name the folder of its files with --from")
+        return RECORDINGS[name].read(folder)
+    if name not in DATASETS:
+        raise BadConfig(f"there is no data set '{name}'; known: {', '.join([*DATASETS, *RECORDINGS])}")
+    if folder is not None:
+        raise BadConfig(f"'{name}' comes with gtsam: it is not read from a folder")
+    return DATASETS[name].read()
 
 
 def _counted(records: Iterable[Record], advance: Callable[[int], None]) -> Iterator[Record]:
@@ -176,4 +200,17 @@ DATASETS: Mapping[str, Dataset] = {
     "w10000": Dataset(
         "simulated, in a grid: 10,000 poses, 64,311 relative poses on /edges; 2-D", pose_graphs.w10000
     ),
+}  # fmt: skip
+
+RECORDINGS: Mapping[str, Recording] = {
+    "victoria_park_raw": Recording(
+        "a truck among trees as recorded: wheel and steering on /odom, trunks without ids on /trees; 2-D", victoria_raw.read
+    ),
+    **{
+        f"mrclam{robot}": Recording(
+            f"robot {robot} of MRCLAM, among 15 landmarks on /landmarks and four robots on /robots; 2-D",
+            partial(mrclam.read, robot=robot),
+        )
+        for robot in mrclam.ROBOTS
+    },
 }  # fmt: skip

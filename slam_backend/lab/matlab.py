@@ -1,4 +1,4 @@
-"""Numeric arrays of a MATLAB 5 file, as far as gtsam's examples need them (MathWorks, MAT-File Format, 2023, "Level 5")."""
+"""Numeric arrays of a MATLAB 5 file, as far as data sets need them (MathWorks, MAT-File Format, 2023, "Level 5")."""
 
 import struct
 import zlib
@@ -16,9 +16,11 @@ NUMBERS = {1: "i1", 2: "u1", 3: "<i2", 4: "<u2", 5: "<i4", 6: "<u4", 7: "<f4", 9
 
 
 def read_arrays(path: Path) -> Mapping[str, Array]:
-    """Name -> array, of the real numeric ones. BadFile if it is no such file."""
+    """Name -> array, of the real numeric ones. BadFile if it cannot be read, or is no such file."""
     try:
         return dict(_arrays(path.read_bytes()[HEAD:]))
+    except OSError as error:
+        raise BadFile(f"{path}: {error.strerror}") from None
     except (ValueError, struct.error, zlib.error) as error:
         raise BadFile(f"{path}: not a MATLAB 5 file, or damaged ({error})") from None
 

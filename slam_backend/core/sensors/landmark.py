@@ -24,6 +24,7 @@ Form = Literal["position", "bearing_range", "bearing", "range"]
 FORMS = frozenset(get_args(Form))
 
 UNNAMED = "?"  # the frame of a sensor that its messages do not tell
+NAMELESS = "?"  # what no message calls a landmark: which one it is must be found out
 COUNTABLE = 2.0**53  # of double precision
 NEAREST = 1e-6  # m; nearer, a landmark has no direction
 
@@ -37,7 +38,7 @@ class LandmarkObservation(Measurement):
     bearing_range  azimuth elevation range    3x3
     bearing   azimuth elevation (rad)         2x2
     range     range (m)                       1x1
-    landmark: its name; empty where the message has none that can be.
+    landmark: its name; NAMELESS where the message has no ids; empty where it has one that names nothing.
     NaN on the diagonal of the covariance means: use the configured default. In 2-D z and elevation are not used.
     """
 
@@ -49,16 +50,14 @@ class LandmarkObservation(Measurement):
 
 
 def decode_points(message: Message, source: str) -> Iterable[LandmarkObservation]:
-    """sensor_msgs/msg/PointCloud2: one observation per point; the fields `id` and `x y [z]`,
-    `range azimuth [elevation]`, `azimuth [elevation]` or `range`; noise by `cov` or `sigma_*`.
+    """sensor_msgs/msg/PointCloud2: one observation per point; the fields `x y [z]`, `range azimuth [elevation]`,
+    `azimuth [elevation]` or `range`, and `id` where landmarks are known apart; noise by `cov` or `sigma_*`.
     """
     from .cloud import columns, scalars
 
     table = columns(message)
-    if "id" not in table:
-        raise BadMessage("point cloud of landmarks lacks the field 'id'")
     frame, _ = parse_frame(message.header.frame_id)
-    stamp, count = stamp_of(message), len(table["id"])
+    stamp, count = stamp_of(message), len(next(iter(table.values()), ()))
     zero = np.zeros(count)
     form: Form
     axes: tuple[str, ...]
@@ -72,8 +71,9 @@ def decode_points(message: Message, source: str) -> Iterable[LandmarkObservation
         form, axes = "range", ("range",)
     else:
         raise BadMessage("point cloud of landmarks has neither 'x' and 'y' nor 'azimuth' nor 'range'")
-    values = scalars({"z": zero, "elevation": zero, **table}, ("id", *axes))[:, 1:]
-    for n, name in enumerate(_names(table["id"])):
+    wanted = ("id", *axes) if "id" in table else axes
+    values = scalars({"z": zero, "elevation": zero, **table}, wanted)[:, -len(axes) :]
+    for n, name in enumerate(_names(table["id"]) if "id" in table else [NAMELESS] * count):
         yield LandmarkObservation(
             stamp, source, frame, name, form,
             frozen(values[n]), frozen(_covariance(table, n, axes)),
@@ -218,6 +218,16 @@ def _sight(offer: Offer, context: Context, config: LandmarkSource, points: dict[
         points[key] = context.pose(pose_key).transformFrom(point)
     factor = space.observe(pose_key, key, value, noise_of(noise, config))
     return Factor(offer.id, "landmark", factor, (pose_key, key), offer.measurement.stamp)
+
+
+def as_point(
+    m: LandmarkObservation, mount: Pose, motion: Motion | None, space: Space, config: LandmarkSource
+) -> tuple[Array, Array]:
+    """Where a landmark is from the keyframe, and the covariance of that. Not for a bearing alone."""
+    value, covariance = _in_space(m, space, config)
+    if m.form == "bearing_range":
+        value, covariance = space.to_cartesian(value, covariance)
+    return moved(value, covariance, mount, motion)
 
 
 def _polar(

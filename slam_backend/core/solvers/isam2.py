@@ -289,10 +289,9 @@ class Believed:
         try:
             if len(keys) == 1:
                 return np.asarray(self._isam.marginalCovariance(keys[0]))
-            joint = self._isam.jointMarginalCovariance(list(keys))
+            return np.asarray(self._isam.jointMarginalCovariance(list(keys)).fullMatrix())
         except _Failures as error:
             raise SolverFailure(_short(error), ()) from None
-        return np.block([[joint.at(i, j) for j in keys] for i in keys])
 
 
 def _check_held(isam: gtsam.ISAM2, keys: Iterable[int]) -> None:

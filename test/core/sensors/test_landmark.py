@@ -324,7 +324,7 @@ def test_a_cloud_without_points_says_nothing():
 @pytest.mark.parametrize(
     ("columns", "text"),
     [
-        ({"x": [1], "y": [1]}, "'id'"),
+        ({"z": [1]}, "'range'"),
         ({"id": [1], "x": [1]}, "azimuth"),
         ({"id": [1], "x": [1], "y": [1], "cov": [[1, 2]]}, "9 are needed"),
         ({"id": [1], "x": [[1, 2]], "y": [[1, 2]]}, "'x' holds 2 numbers"),
