@@ -32,6 +32,7 @@ _HEAD = Struct("<HxxiI").unpack_from  # encapsulation, seconds, nanoseconds
 _LENGTH = Struct("<I").unpack_from
 _LITTLE_ENDIAN = 0x0100  # the bytes 00 01
 _NAMES_AT = 12  # where the frame id begins; eight bytes of stamp lie before it
+_HEADER = "std_msgs/msg/Header"
 _F8 = np.dtype("<f8")
 _REMEMBERED, _LONG = 4096, 512  # entries at most; bytes from which on names are not worth remembering
 
@@ -136,6 +137,15 @@ class _Route(NamedTuple):
     fast: _Fast | None
     names: _Names
     slow: _Slow | None
+
+
+def header_stamp(typestore: Typestore, record: Record) -> int | None:
+    """Of a message that begins with a header, without decoding it; None of any other."""
+    _, fields = typestore.fielddefs.get(record.type, ((), ()))
+    if not fields or fields[0][1][1] != _HEADER or len(record.data) < _NAMES_AT:
+        return None
+    encapsulation, seconds, nanoseconds = _HEAD(record.data, 0)
+    return int(seconds * SECOND + nanoseconds) if encapsulation == _LITTLE_ENDIAN else None
 
 
 class Decoder:

@@ -7,7 +7,7 @@ from ..core.check import checked
 from ..core.config import Config
 from ..core.measurement import SECOND
 from ..core.sensors.odometry import TRANSFORMS, OdometryPose
-from ..io.cdr import Decoder
+from ..io.cdr import Decoder, header_stamp
 from ..io.inputs import TF_STATIC
 from ..io.journal import LIMIT, LIMIT_BYTES
 from ..io.records import Record
@@ -47,7 +47,7 @@ class Intake:
         self._early = Backlog(LIMIT, LIMIT_BYTES)  # heard between two sessions
         self._doubtful = Backlog(
             DOUBTFUL, DOUBTFUL_BYTES
-        )  # since the odometry went back in time; its next message tells
+        )  # what went back in time; the odometry's next message tells whether its clock did
         self._static: dict[bytes, str] = {}  # what came on /tf_static, and its type
         self._driving = ""
         self._decoder = Decoder(typestore, {})
@@ -94,9 +94,9 @@ class Intake:
             self._early.dropped += self._doubtful.dropped
             self._early.put_back([*self._doubtful.clear(), (topic, type_, data)])
             return
-        if self._jumps.doubts:
+        if self._jumps.doubts or self._is_behind(record):
             self._doubtful.append((topic, type_, data))
-        else:
+        elif odometry:
             self._doubtful.clear()
         if type_ == TRANSFORMS and topic == self._driving and not odometry:
             return  # of other frames
@@ -114,6 +114,11 @@ class Intake:
         if record.topic in finder.unused:
             self._host.ignore(record.topic, finder.unused[record.topic])
         return finder.wants(record, self._host.config)
+
+    def _is_behind(self, record: Record) -> bool:
+        """Whether it may be of the time after a jump of which the driving source has not told yet; or it is just late."""
+        stamp = header_stamp(self._typestore, record)
+        return stamp is not None and self._jumps.goes_back(stamp)
 
     def _odometry_in(self, record: Record) -> Sequence[OdometryPose]:
         """What the driving source says in it, unless it cannot be right."""
@@ -134,9 +139,13 @@ class Jumps:
         """Whether the newest stamp went back, and the next one tells whether it was a jump."""
         return self._behind is not None
 
+    def goes_back(self, stamp: int) -> bool:
+        """Whether a stamp (ns), of any source, lies more than JUMP before the newest."""
+        return stamp < self._newest - JUMP
+
     def jumped_back(self, stamp: int) -> bool:
         """Whether this stamp (ns) confirms a jump: the second in a row that lies more than JUMP back; told once for each."""
-        behind = stamp < self._newest - JUMP
+        behind = self.goes_back(stamp)
         jumped = behind and self._behind is not None and self._behind < stamp < self._behind + JUMP
         self._behind = stamp if behind and not jumped else None
         self._newest = stamp if jumped else max(self._newest, stamp)

@@ -168,13 +168,23 @@ class Node:
     config: Config
     session: object = None
     moves: list[int] = field(default_factory=list)
+    anew: list[str] = field(default_factory=list)
+
+    def begins_anew(self, source) -> bool:
+        self.anew.append(source)
+        self.session = None
+        return True
 
     def moved(self, odometry) -> None:
         self.moves.append(odometry.stamp)
 
 
-def test_a_flood_between_two_sessions_costs_its_own_oldest_and_is_confessed(tmp_path, monkeypatch) -> None:
-    monkeypatch.setattr(intake_module, "LIMIT", 100)
+def odometry(seconds):
+    return encode_odometry(START + round(seconds * SECOND), "odom", "base", POSE, *ZEROS)
+
+
+def wheels_and_tags():
+    """A node that has these sources, and its intake."""
     config = config_from(
         {
             "sources": ["wheels", "tags"],
@@ -185,9 +195,36 @@ def test_a_flood_between_two_sessions_costs_its_own_oldest_and_is_confessed(tmp_
     node = Node(config)
     intake = Intake(node, typestore_of(()), finding=False)
     intake.use(config)
+    return node, intake
+
+
+def test_what_comes_just_before_the_odometry_tells_of_a_jump_is_for_the_new_session(tmp_path) -> None:
+    """Topics overtake each other: of a bag that is played again, the tags may come before the odometry."""
+    node, intake = wheels_and_tags()
+    before, after = (Journal(tmp_path / name, print) for name in ("before", "after"))
+    node.session = SimpleNamespace(journal=before)
+    for data in (odometry(10), odometry(11)):
+        intake.receive("/odom", ODOMETRY.type, data)
+    intake.receive("/tags", TAGS.type, TAGS.data)
+    for data in (odometry(0), odometry(0.1)):
+        intake.receive("/odom", ODOMETRY.type, data)
+    assert node.anew == ["wheels"]
+    node.session = SimpleNamespace(journal=after)
+    intake.drain()
+    for journal in (before, after):
+        journal.close()
+    reader = JournalReader(after.path)
+    found = [row.record for row in reader.after(0, 10)]
+    reader.close()
+    assert [record.topic for record in found] == ["/tags", "/odom", "/odom"]
+    assert [record.data for record in found][1:] == [odometry(0), odometry(0.1)]
+
+
+def test_a_flood_between_two_sessions_costs_its_own_oldest_and_is_confessed(tmp_path, monkeypatch) -> None:
+    monkeypatch.setattr(intake_module, "LIMIT", 100)
+    node, intake = wheels_and_tags()
     for n in range(40):
-        stamp = START + n * SECOND // 10
-        intake.receive("/odom", ODOMETRY.type, encode_odometry(stamp, "odom", "base", POSE, *ZEROS))
+        intake.receive("/odom", ODOMETRY.type, odometry(n / 10))
         for _ in range(10):
             intake.receive("/tags", TAGS.type, TAGS.data)
     incidents = []
