@@ -168,10 +168,22 @@ class Applier:
                     return False
                 continue
             finally:
-                self.decisions += self._solver.incidents()
+                self._note(self._solver.incidents())
             self._book(delta)
             return whole
         return whole
+
+    def _note(self, incidents: Sequence[Decision]) -> None:
+        """What went wrong; and what the solver had to let go of is in nobody's books any more."""
+        self.decisions += incidents
+        gone = tuple(decision.id for decision in incidents if decision.verdict == "removed")
+        if not gone:
+            return
+        self._booked(Delta(remove=gone))
+        held = {key for factor in self._solver.factors.values() for key in factor.keys}
+        for key in [key for key in self._parts.all() if not is_pose(key) and key not in held]:
+            self._parts.drop(key)
+            self.sighted.pop(key, None)
 
     def _book(self, delta: Delta) -> None:
         for factor in delta.add:

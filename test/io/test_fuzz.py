@@ -325,11 +325,6 @@ def test_what_is_refused_leaves_no_trace(driver: str, space: str, noise: str) ->
 
 
 @pytest.mark.slow
-@pytest.mark.xfail(
-    raises=RuntimeError,
-    strict=False,
-    reason="a graph of wrong measurements that iSAM2 cannot be rebuilt from: seeds 1039, 4029, 6007, 6038, 8028, 9024",
-)
 @pytest.mark.parametrize("part", range(10))
 def test_a_hundred_thousand_spoilt_messages(part: int) -> None:
     begin = process_time()

@@ -6,12 +6,14 @@ are stored here, and after any failure the ISAM2 is dropped and rebuilt from the
     QR from the last linearization point, re-linearized until nothing moves
     batch Levenberg-Marquardt, then QR from its optimum
     the same without the factors of the change that cannot be solved: SolverFailure names them
+    without earlier ones too: what is kept then, see salvage
 
 Cholesky is about twice as fast as QR on graphs rich in loops, but throws on long open trajectories and on
 strongly anisotropic information; once it has thrown for no single factor's fault, QR serves for the rest of the run.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 from math import isfinite
 from typing import Any
 
@@ -25,6 +27,7 @@ from ..graph import Decision, Delta, Estimate, Factor, Pose
 from ..measurement import Array
 from ..space import Space
 from ..variables import estimate_in, largest
+from .salvage import salvaged
 
 SETTLED = 1e-10  # largest change of a variable (m, rad) at which a rebuild is done
 ROUNDING = 1e-10  # relative change of the cost at which a step that no longer shrinks is only rounding
@@ -61,6 +64,8 @@ class Isam2:
         self._force.force_relinearize = True
 
     def update(self, delta: Delta) -> Estimate:
+        if not self.factors.keys() >= set(delta.remove):  # what had to be let go of before is gone already
+            delta = replace(delta, remove=tuple(id_ for id_ in delta.remove if id_ in self.factors))
         fresh = [key for key in delta.values if not self._isam.valueExists(key)]
         try:
             if len(fresh) < len(delta.values):
@@ -157,10 +162,33 @@ class Isam2:
                 self._note("rebuilt", error, _stamp(delta))
                 return
         self._qr = qr
-        self._isam, self._slots = self._climb(list(self.factors.values()), before)
+        try:
+            self._isam, self._slots = self._climb(list(self.factors.values()), before)
+        except _Failures:
+            self._salvage(before, _stamp(delta))
         without = guilty or tuple(f"removing {id_}" for id_ in delta.remove)
         self._note("rolled_back", error, _stamp(delta), f"; without {', '.join(without)}")
         raise SolverFailure(_short(error), guilty) from None
+
+    def _salvage(self, before: gtsam.Values, stamp: int) -> None:
+        """Not even what has been solved before can be solved again: go on with less."""
+
+        def solve(factors: Sequence[Factor], values: gtsam.Values) -> gtsam.Values | None:
+            try:
+                self._isam, self._slots = self._climb(factors, values)
+            except _Failures:
+                return None
+            return self._isam.calculateBestEstimate()
+
+        self._qr = True
+        kept, values = salvaged(self.factors.values(), (before, _values(self._guesses)), self._space, solve)
+        self._isam, self._slots = self._built(kept, values)
+        held = {factor.id: factor for factor in kept}
+        gone = [factor for factor in self.factors.values() if factor.id not in held]
+        self.factors.clear()  # others hold on to the store itself
+        self.factors.update(held)
+        self._guesses = {key: guess for key, guess in self._guesses.items() if values.exists(key)}
+        self._incidents += [_withdrawn(factor, stamp) for factor in gone]
 
     def _refuge(self, fresh: Iterable[int]) -> gtsam.Values:
         """Where to start a rebuild: iSAM2's linearization point without new variables; first guesses if that is lost."""
@@ -313,6 +341,13 @@ def _values(guesses: Mapping[int, Any]) -> gtsam.Values:
     for key, value in guesses.items():
         values.insert(key, value)
     return values
+
+
+def _withdrawn(factor: Factor, stamp: int) -> Decision:
+    return Decision(
+        stamp, factor.id, factor.source, "removed", "solver", "withdrawn",
+        "the graph could not be solved any more, and can be without it", ends=factor.stamps,
+    )  # fmt: skip
 
 
 def _stamp(delta: Delta) -> int:
