@@ -2,8 +2,9 @@
 
 Wrong measurements, each of which could be solved when it came, may together leave no optimum that can be reached from where
 they have drawn the estimate. Then a tree is solved first: of what holds each pose, gauges and motion before others. The
-other factors come to it again in halves, the oldest first; what cannot be solved with those before it stays out. If not
-even the tree can be solved, every pose is held where it was believed to be.
+other factors come to it again in halves, the oldest first; what cannot be solved with those before it stays out. A part that
+something else than a pose held before, say the earth under its fixes, and where not even the tree can be solved every
+pose, is held where it was believed to be.
 """
 
 from collections.abc import Callable, Iterable, Sequence
@@ -31,19 +32,19 @@ def salvaged(
 
     starts: values of every variable, those that are tried first before others.
     """
-    tree, rest = _tree(factors, space.dimension)
+    last = starts[-1]
+    tree, rest = _tree(factors, last, space)
     for start in starts:
         found = solve(tree, layout(tree, start).touched(start))
         if found is not None:
             return _with_others(tree, rest, found, start, solve)
-    last = starts[-1]
     held = [_anchor(key, last, space) for key in last.keys() if is_pose(key)]  # noqa: SIM118  # no dict
     return held, layout(held, last).touched(last)
 
 
-def _tree(factors: Iterable[Factor], dimension: int) -> tuple[list[Factor], list[Factor]]:
+def _tree(factors: Iterable[Factor], values: gtsam.Values, space: Space) -> tuple[list[Factor], list[Factor]]:
     """Of the factors that hold a whole pose, alone or by another one, those without which one would float; and all others."""
-    above: dict[int, int] = {}
+    above = {GROUND: GROUND}
 
     def root(key: int) -> int:
         while above.setdefault(key, key) != key:
@@ -52,13 +53,15 @@ def _tree(factors: Iterable[Factor], dimension: int) -> tuple[list[Factor], list
 
     tree, rest = [], []
     for factor in sorted(factors, key=lambda factor: factor.kind not in ("gauge", "motion")):
-        ends = {root(key) for key in (*factor.keys, GROUND)[:2]}
-        if len(ends) == 2 and all(map(is_pose, factor.keys)) and factor.factor.dim() == dimension:
+        whole = all(map(is_pose, factor.keys)) and factor.factor.dim() == space.dimension
+        ends = {root(key) for key in (*factor.keys, GROUND)[:2]} if whole else ()
+        if len(ends) == 2:
             above[max(ends)] = min(ends)
             tree.append(factor)
         else:
             rest.append(factor)
-    return tree, rest
+    floating = sorted({root(key) for key in above} - {GROUND})
+    return tree + [_anchor(key, values, space) for key in floating], rest
 
 
 def _with_others(
@@ -74,7 +77,8 @@ def _with_others(
         better = solve(more, values)
         if better is not None:
             kept, found = more, better
-        elif len(groups) > 1:
+        elif len(more) > len(kept) + 1:
+            groups = groups if len(groups) > 1 else [[factor] for factor in groups[0]]
             halves += [groups[len(groups) // 2 :], groups[: len(groups) // 2]]
     return kept, found
 

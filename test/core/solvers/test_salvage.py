@@ -100,6 +100,32 @@ def test_what_cannot_be_solved_any_more_is_let_go_of_alone() -> None:
     agrees(solver)
 
 
+def test_a_part_that_the_earth_held_is_held_by_one_of_its_poses() -> None:
+    """And by the earth again, as far as that can be solved."""
+    solver, moody = driven(), Moody(gtsam.Pose2(10, 0, 0))
+    noise = gtsam.noiseModel.Diagonal.Sigmas([0.1, 0.1, 1e6])
+    earth = gtsam.symbol("e", 0)
+    prior = gtsam.PriorFactorPose2(earth, gtsam.Pose2(), NOISE)
+    fixes = [
+        Factor(
+            f"fixes/{k}",
+            "gnss",
+            gtsam.BetweenFactorPose2(earth, X(k), gtsam.Pose2(k, 0, 0), noise),
+            (X(k), earth),
+            k,
+        )
+        for k in range(0, COUNT, 5)
+    ]
+    datum = Factor("datum", "datum", prior, (earth,), 0)
+    solver.update(Delta((datum, *fixes), ("gauge/0",), {earth: gtsam.Pose2()}))
+    solver.update(Delta((loop(5, 15, moody.factor(X(5), X(15))),)))
+    before = set(solver.factors)
+    moody.good = False
+    assert fail(solver) == {"loops/5-15"}
+    assert set(solver.factors) == before - {"loops/5-15"} | {"gauge/x0"}
+    agrees(solver)
+
+
 def test_where_not_even_the_motion_can_be_solved_every_pose_stays_where_it_was() -> None:
     moody = Moody(FORWARD)
     solver = driven(moody)
