@@ -7,7 +7,7 @@ sound ones, from bytes to the estimate.
 import struct
 from collections.abc import Callable, Iterator, Sequence
 from time import process_time
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
@@ -115,6 +115,30 @@ def points(n: int, stamp: int) -> bytes:
     )  # fmt: skip
 
 
+def header(stamp: int, frame: str) -> Any:
+    time = STORE.types["builtin_interfaces/msg/Time"](*divmod(stamp, SECOND))
+    return STORE.types["std_msgs/msg/Header"](time, frame)
+
+
+def echo(n: int, stamp: int) -> bytes:
+    x, y, *_ = pose(n)
+    measured = float(np.hypot(x - 5.0 * (n % 3), y - 4.0))
+    message = STORE.types["sensor_msgs/msg/Range"](
+        header(stamp, f"beacon{n % 3}"), 0, 0.1, 0.1, 100.0, measured, 0.01
+    )
+    return bytes(STORE.serialize_cdr(message, "sensor_msgs/msg/Range"))
+
+
+def fix(n: int, stamp: int) -> bytes:
+    x, y, z, *_ = pose(n)
+    status = STORE.types["sensor_msgs/msg/NavSatStatus"](0, 1)
+    place = 48.0 + y / 111_200, 11.0 + x / 74_500, 500.0 + z
+    message = STORE.types["sensor_msgs/msg/NavSatFix"](
+        header(stamp, "antenna"), status, *place, np.eye(3).ravel(), 2
+    )
+    return bytes(STORE.serialize_cdr(message, "sensor_msgs/msg/NavSatFix"))
+
+
 INPUTS = {
     "wheels": Input("odometry", "nav_msgs/msg/Odometry", odometry),
     "visual": Input("odometry", "geometry_msgs/msg/PoseWithCovarianceStamped", pose_with_covariance),
@@ -124,9 +148,11 @@ INPUTS = {
     "batches": Input("relative", "sensor_msgs/msg/PointCloud2", relatives),
     "trees": Input("landmark", "sensor_msgs/msg/PointCloud2", points),
     "fixes": Input("pose", "geometry_msgs/msg/PoseWithCovarianceStamped", pose_with_covariance),
+    "beacons": Input("landmark", "sensor_msgs/msg/Range", echo),
+    "satellites": Input("gnss", "sensor_msgs/msg/NavSatFix", fix),
     "/tf_static": Input("static", "tf2_msgs/msg/TFMessage", mounts),
 }
-OBSERVING = ("loops", "batches", "trees", "fixes", "/tf_static")
+OBSERVING = ("loops", "batches", "trees", "fixes", "beacons", "satellites", "/tf_static")
 SPECIAL = [
     np.nan,
     np.inf,

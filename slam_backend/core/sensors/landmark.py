@@ -174,8 +174,8 @@ def _placed(
     for wait in waits:
         m = wait.offer.measurement
         assert isinstance(m, LandmarkObservation)
-        placed = context.landing(m.stamp)
-        if context.component(placed.keyframe.pose) == part:
+        placed = context.place(m.stamp)  # its keyframe may have been taken back since
+        if placed is not None and context.component(placed.keyframe.pose) == part:
             seen = _in_space(m, context.space, config)
             sightings.append(sighting(m.form, seen, placed, _mount(m, context, config), context))
             offers.append(wait.offer)
