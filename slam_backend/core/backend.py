@@ -15,6 +15,7 @@ from .association import Associator
 from .beside import Beside
 from .command import Command
 from .config import Config, GnssSource, LandmarkSource, OdometrySource, PoseSource, RelativeSource
+from .consistency import Fit
 from .context import Context, unknown_frame
 from .editor import Editor, Shift
 from .edits import Wishes
@@ -238,6 +239,18 @@ class Backend:
     def left_out(self) -> list[Factor]:
         """Factors that were offered and are not in the graph: refused, on probation, or taken out by a person."""
         return self._editor.left_out
+
+    def recent(self, count: int) -> Fit:
+        """The newest factors at the present estimate; what is older than all of them is held where it is."""
+        factors = list(self.solver.factors.values())[-count:]
+        values = gtsam.Values()
+        for key in sorted({key for factor in factors for key in factor.keys}):
+            values.insert(key, self.estimate.value(key))
+        begin = min(
+            (symbolIndex(f.keys[0]) for f in factors if f.kind == "motion"), default=len(self.timeline)
+        )
+        born = {key: pose for key, (pose, _) in self._applier.sighted.items()}
+        return Fit(factors, values, lambda key: symbolIndex(born.get(key, key)) > begin and key != EARTH)
 
     def snapshot(self) -> Snapshot:
         """Everything believed now; costs time in proportion to the graph."""

@@ -10,10 +10,11 @@ every factor is its whitened Jacobian and its whitened residual, robust weight i
     keys      (M,) those variables, all factors  columns  (M,) their dimensions
     numbers   the Jacobians one after the other, row by row
     errors    the residuals one after the other; their squares sum to chi-square
+    free      (F,) degrees of freedom of each that the others check (core/consistency.py)
 """
 
 import zlib
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from functools import cached_property
 from itertools import accumulate
 from pathlib import Path
@@ -24,42 +25,35 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
+from ..core.consistency import Fit
 from ..core.errors import BadFile, SolverFailure
-from ..core.graph import Factor, keyframe
+from ..core.graph import keyframe
 from ..core.measurement import Array
 from ..core.trajectory import Stamps
 
 ARRAYS = {"indices": "i", "counts": "i", "rows": "i", "keys": "u", "columns": "i", "numbers": "f",
-          "errors": "f", "ids": "U", "kinds": "U", "landmarks": "u"}  # fmt: skip
+          "errors": "f", "ids": "U", "kinds": "U", "free": "f", "landmarks": "u"}  # fmt: skip
 Strings = NDArray[np.str_]
 ADDABLE = 3  # variables of a factor that gtsam can make from matrices directly
 
 
-def write_linearized(
-    path: Path,
-    factors: Iterable[Factor],
-    values: gtsam.Values,
-    indices: Stamps,
-    landmarks: Sequence[int] = (),
-) -> None:
-    """factors: at `values`; inactive ones are left out."""
-    sizes = values.zeroVectors()
-    active = [(f, each) for f in factors if (each := f.factor.linearize(values)) is not None]
-    keys = [list(each.keys()) for _, each in active]
-    systems = [each.jacobian() for _, each in active]
+def write_linearized(path: Path, fit: Fit, indices: Stamps, landmarks: Sequence[int] = ()) -> None:
+    """indices: of the keyframes, in order of stamp; landmarks: their variables."""
+    keys = [list(each.keys()) for each in fit.linear]
     flat = [key for each in keys for key in each]
     np.savez_compressed(
         path,
         indices=indices,
         landmarks=np.array(landmarks, dtype=np.uint64),
         counts=np.array([len(each) for each in keys], dtype=np.int64),
-        rows=np.array([len(errors) for _, errors in systems], dtype=np.int64),
+        rows=fit.rows,
         keys=np.array(flat, dtype=np.uint64),
-        columns=np.array([len(sizes.at(key)) for key in flat], dtype=np.int64),
-        numbers=np.concatenate([np.zeros(0), *(jacobian.ravel() for jacobian, _ in systems)]),
-        errors=np.concatenate([np.zeros(0), *(errors for _, errors in systems)]),
-        ids=np.array([f.id for f, _ in active], dtype=np.str_),
-        kinds=np.array([f.kind for f, _ in active], dtype=np.str_),
+        columns=np.array([fit.sizes[key] for key in flat], dtype=np.int64),
+        numbers=np.concatenate([np.zeros(0), *(jacobian.ravel() for jacobian, _ in fit.systems)]),
+        errors=fit.residuals,
+        ids=np.array([f.id for f in fit.factors], dtype=np.str_),
+        kinds=np.array([f.kind for f in fit.factors], dtype=np.str_),
+        free=fit.free,
     )
 
 
@@ -125,41 +119,24 @@ class Linearized:
             raise SolverFailure(f"keyframe {index}: the factors do not determine its pose", ())
         return found
 
-    def redundancy(self, draws: int = 4) -> Array:
-        """(F,) degrees of freedom of each factor that the others check: what its chi-square is on average, if every noise is stated truly.
-
-        The diagonal of I - A (A^T A)^-1 A^T: each draw fits white noise and looks at what is left. A sum over many factors has a relative
-        error of about sqrt(2 / draws / sum).
-        """
-        random, ends = np.random.default_rng(0), np.cumsum(self.rows)
-        left = np.zeros(len(ends))
-        for _ in range(draws):
-            noise = random.standard_normal(int(self.rows.sum()))
-            graph = self._graph(noise)
-            fit = graph.optimize()
-            errors = np.concatenate([graph.at(n).error_vector(fit) for n in range(graph.size())])
-            remains = np.concatenate([[0.0], np.cumsum(errors**2)])
-            left += (remains[ends] - remains[ends - self.rows]) / draws
-        return left
+    @property
+    def free(self) -> Array:
+        """(F,) degrees of freedom of each factor that the others check."""
+        self._fits()
+        return np.asarray(self._arrays["free"])
 
     @cached_property
     def _tree(self) -> Any:  # a GaussianBayesTree
         """By QR, which long open trajectories do not break."""
-        return self._graph(np.zeros(int(self.rows.sum()))).eliminateMultifrontal(function=gtsam.EliminateQR)
-
-    def _graph(self, right: Array) -> Any:  # a GaussianFactorGraph
-        """right: all right-hand sides, one after the other."""
         graph: Any = gtsam.GaussianFactorGraph()
-        at = 0
         for terms, rows in self._factors():
-            side = right[at : at + rows]
-            at += rows
+            side = np.zeros(rows)
             if len(terms) <= ADDABLE:
                 graph.add(*(part for term in terms for part in term), side)
             else:  # a conditional is a factor too, and takes any number of variables
                 unit = gtsam.noiseModel.Unit.Create(rows)
                 graph.push_back(gtsam.JacobianFactor(gtsam.GaussianConditional(terms, 1, side, unit)))
-        return graph
+        return graph.eliminateMultifrontal(function=gtsam.EliminateQR)
 
     def _factors(self) -> Iterator[tuple[list[tuple[int, Array]], int]]:
         """(variable, its block) of each factor, and the number of rows."""
@@ -177,10 +154,10 @@ class Linearized:
             yield list(zip(keys[end - count : end], parts, strict=True)), height
 
     def _fits(self) -> None:
-        counts, rows, keys, columns, numbers, errors, ids, kinds = (
-            self._arrays[name] for name in list(ARRAYS)[1:9]
+        counts, rows, keys, columns, numbers, errors, ids, kinds, free = (
+            self._arrays[name] for name in list(ARRAYS)[1:10]
         )
-        whole = len({len(each) for each in (counts, rows, ids, kinds)}) == 1
+        whole = len({len(each) for each in (counts, rows, ids, kinds, free)}) == 1
         whole = whole and counts.sum() == len(keys) == len(columns) and rows.sum() == len(errors)
         if whole and len(counts):
             widths = np.add.reduceat(columns, np.cumsum(counts) - counts)

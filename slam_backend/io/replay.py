@@ -2,7 +2,7 @@
 
 import platform
 import resource
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from importlib.metadata import PackageNotFoundError, version
@@ -17,6 +17,7 @@ from ..core.backend import Backend, Update
 from ..core.check import checked, pace_of, rechecked
 from ..core.command import LOAD, Command
 from ..core.config import Config, config_from, config_hash, config_to
+from ..core.consistency import Consistency, Fit, blind_axes
 from ..core.decisions import DecisionLog
 from ..core.errors import BadFile, SlamError
 from ..core.fingerprint import run_hash
@@ -329,6 +330,16 @@ class Result:
         return self.run.backend.estimate.values()
 
     @cached_property
+    def fit(self) -> Fit:
+        """The kept factors at the final estimate."""
+        return Fit(self.factors, self.values)
+
+    @cached_property
+    def consistency(self) -> Mapping[str, Consistency]:
+        """By source: whether its noise is what it says."""
+        return self.fit.consistency(blind_axes(self.run.config))
+
+    @cached_property
     def summary(self) -> dict[str, Any]:
         """What summary.json holds."""
         run, loops = self.run, self.decisions.loops()
@@ -361,6 +372,7 @@ class Result:
                 "online": run.online_cost,
                 "final": cost(self.factors, self.values),
             },
+            "consistency": {source: each.as_json() for source, each in self.consistency.items()},
             "batch": None if run.batch is None else _told(run.batch),
             "timing": run.seconds.summary(),
             "memory_mb": round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024, 1),

@@ -68,7 +68,7 @@ def write_run(result: Result, out: Path | str) -> None:
     _write_decisions(out / "decisions.jsonl", result)
     write_graph(out / "graph.g2o", pose_graph(result))
     landmarks = [result.run.backend.landmark(name) for name in snapshot.names]
-    write_linearized(out / "linearized.npz", result.factors, result.values, snapshot.indices, landmarks)
+    write_linearized(out / "linearized.npz", result.fit, snapshot.indices, landmarks)
     write_yaml(out / "config.yaml", result.run.config)
     write_edits(out / EDITS, result.run.edits)
     write_map(out / MAP, result.run.backend.saved(result.run.online, result.summary["run_hash"]))

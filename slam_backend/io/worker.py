@@ -19,6 +19,7 @@ from typing import Any, Literal
 from ..core.backend import Update
 from ..core.command import parse
 from ..core.config import Config
+from ..core.consistency import blind_axes
 from ..core.errors import SlamError
 from ..core.graph import Decision, keyframe
 from ..core.measurement import Measurement
@@ -29,6 +30,9 @@ from .replay import Result, Run
 from .rundir import write_run
 from .typestore import typestore_of
 
+RECENT = 1500  # factors at which the noise of the sources is looked at: some 30 ms
+FIRST = 100  # factors, below which it is not
+
 RequestName = Literal["snapshot", "covariance", "dry_run", "save", "finish"]
 
 
@@ -36,7 +40,7 @@ RequestName = Literal["snapshot", "covariance", "dry_run", "save", "finish"]
 class Report:
     """What changed since the last one. applied: id of the newest row that was read. covariance: of the newest keyframe's pose, 36
     numbers in ROS order; None without updates, or when it is not determined. update_ms: median and p99. reached: the newest stamp (ns)
-    that has been applied.
+    that has been applied. consistency: by source, whether its noise is what it says, as summary.json has it; None: as before.
     """
 
     applied: int
@@ -47,6 +51,7 @@ class Report:
     update_ms: tuple[float, float]
     memory_mb: float
     reached: int = 0
+    consistency: Mapping[str, Any] | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -147,6 +152,7 @@ class _Worker:
         self._run = Run(self._inputs, config, [])
         self._updates: list[Update] = []
         self._told = 0
+        self._judged = 0  # factors, when the noise of the sources was looked at last
 
     def serve(self) -> None:
         failed = ""
@@ -177,8 +183,19 @@ class _Worker:
             self._run.seconds.recent(),
             resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
             self._run.reached,
+            self._consistency(),
         )
         self._pipe.send(report)
+
+    def _consistency(self) -> Mapping[str, Any] | None:
+        """Of the newest factors, each time that half of them are new."""
+        backend, last = self._run.backend, self._judged
+        factors = len(backend.solver.factors)
+        if factors < FIRST or last <= factors < last + min(last, RECENT // 2):
+            return None
+        self._judged = factors
+        found = backend.recent(RECENT).consistency(blind_axes(self._run.config))
+        return {source: each.as_json() for source, each in found.items()}
 
     def _covariance(self, update: Update) -> tuple[float, ...] | None:
         backend = self._run.backend

@@ -54,7 +54,15 @@ class Diagnostics:
             for (who, rule), n in list(counts.items())
             if who == source
         }
+        fit = self._state.consistency.get(source, {})
         values = {"topic": topic, **{rule: str(n) for rule, n in told.items()}}
+        if "ratio" in fit:
+            low, high = fit["bounds_95"]
+            values |= {
+                "nis": f"{fit['ratio']:.2f}",
+                "nis_bounds": f"{low:.2f} to {high:.2f}",
+                "noise": fit["advice"],
+            }
         if topic in inputs.unreadable:
             return ERROR, f"the topic has {inputs.unreadable[topic]}, which its kind cannot read", values
         flow = inputs.flows.get(topic)
@@ -73,7 +81,7 @@ class Diagnostics:
         return (*self._verdict(source, told), values)
 
     def _verdict(self, source: str, told: Mapping[str, int]) -> tuple[int, str]:
-        """By the firewall's table: the worst of what it has said lately, and what to do about it."""
+        """By the firewall's table: the worst of what it has said lately, and what to do about it; else whether its noise is true."""
         now, news = monotonic(), []
         for id_, count in told.items():
             before, when = self._said.get((source, id_), (0, 0.0))
@@ -83,7 +91,8 @@ class Diagnostics:
                 news.append(id_)
         worst = max(news, key=lambda id_: LEVELS[_severity(id_)], default=None)
         if worst is None:
-            return OK, "receiving"
+            advice = self._state.consistency.get(source, {}).get("advice")
+            return (WARN, f"receiving; its noise is {advice}") if advice else (OK, "receiving")
         rule = rule_of(worst)
         advice = f": {rule.what}; {rule.advice}" if rule is not None else ""
         verb = "refused" if any((source, id_) in self._state.refused for id_ in news) else "kept"

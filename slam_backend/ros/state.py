@@ -2,8 +2,9 @@
 
 import threading
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from time import monotonic
+from typing import Any
 
 from ..core.backend import Update
 from ..core.firewall.rules import rule_of
@@ -26,6 +27,7 @@ class State:
         self.update: Update | None = None
         self.covariance: tuple[float, ...] | None = None  # 36, ROS order, of the newest keyframe
         self.snapshot: Snapshot | None = None
+        self.consistency: Mapping[str, Any] = {}  # by source, as summary.json has it
         self.decided: dict[str, Decision] = {}
         self.refused: dict[tuple[str, str], int] = {}  # (source, stage/reason) -> count
         self.noted: dict[tuple[str, str], int] = {}  # the same for what the firewall kept, with a remark
@@ -45,6 +47,7 @@ class State:
     def take(self, report: Report) -> None:
         with self._lock:
             self.report = report
+            self.consistency = self.consistency if report.consistency is None else report.consistency
             self._note(report.updates)
             if report.updates:
                 self._newest = report.updates[-1], report.covariance
@@ -122,6 +125,7 @@ class State:
             self._revision = 0
             self.revisions.clear()
             self._unshown, self._behind, self._newest = False, 0, None
+            self.consistency = {}
 
     def untold_decisions(self) -> list[Decision]:
         """Those that have not been published yet; each is handed out once."""

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from slam_backend import cli
+from slam_backend.core.consistency import Fit
 from slam_backend.core.errors import BadFile
 from slam_backend.core.geometry import seven_of_matrix
 from slam_backend.core.graph import Factor, keyframe
@@ -254,7 +255,7 @@ def long_run(out: Path, keyframes: int = 7000, samples: int = 20) -> None:
     ]
     factors = [Factor(str(n), "any", each, tuple(each.keys()), 0) for n, each in enumerate(made)]
     out.mkdir()
-    write_linearized(out / "linearized.npz", factors, values, np.arange(keyframes))
+    write_linearized(out / "linearized.npz", Fit(factors, values), np.arange(keyframes))
     stamps = np.arange(len(poses), dtype=np.int64) * (SECOND // 20) + SECOND
     sevens = seven_of_matrix(np.stack([pose.matrix() for pose in poses]))
     last = (keyframes - 1) * samples + 1

@@ -324,6 +324,25 @@ def test_a_plane_needs_no_floor():
 # -- honest together ---------------------------------------------------------------------------------
 
 
+@pytest.mark.parametrize("lie", [1.0, 5.0])
+def test_an_odometry_that_lies_is_found_among_the_newest_factors(lie):
+    """On the heading alone; as a running node looks at it, with what is older held where it is."""
+    honest = {
+        "sigma_translation_per_meter": 0.03,
+        "sigma_rotation_per_meter": 0.01,
+        "sigma_rotation_per_radian": 0.0,
+    }
+    exact = {name: sigma / 100 for name, sigma in honest.items()}
+    sources = {"wheels": honest, "visual": honest | {"sigma_rotation_per_meter": 0.01 / lie}, "lidar": exact}
+    backend = Backend(config("2d", {"distance": 0.9}, **sources))
+    walks = [walk(name, "2d", np.random.default_rng(n), 300) for n, name in enumerate(("wheels", "visual"))]
+    run(backend, *walks, [told("lidar", float(n), pose(n)) for n in range(301)])
+    found = backend.recent(450).consistency()
+    assert [found[name].factors for name in sources] == [150, 150, 150]
+    assert found["wheels"].advice == ""
+    assert ("optimistic in yaw" in found["visual"].advice) is (lie > 1)
+
+
 @pytest.mark.slow
 @BOTH
 def test_two_odometries_together_state_their_error_truly(space):
@@ -345,11 +364,11 @@ def test_two_odometries_together_state_their_error_truly(space):
     assert abs(total - 200 * dimension) < spread
 
 
-def walk(source, space, rng):
-    """A metre a step, ten steps, straight on; the noise of each step as the model says."""
+def walk(source, space, rng, steps=10):
+    """A metre a step, straight on; the noise of each step as the model says."""
     here, items = SPACES[space].identity, []
     sigmas = np.sqrt(np.diag(SPACES[space].diagonal(0.01**2, 0.03**2)))
-    for n in range(11):
+    for n in range(steps + 1):
         items.append(told(source, float(n), matrix_of(np.array(SPACES[space].seven(here)))))
         step = SPACES[space].expmap(SPACES[space].logmap(SPACES[space].pose((1, 0, 0, 0, 0, 0, 1))))
         here = here.compose(step).compose(SPACES[space].expmap(sigmas * rng.normal(size=len(sigmas))))

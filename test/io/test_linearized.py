@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from gtsam.symbol_shorthand import B, V, X
 
+from slam_backend.core.consistency import Fit
 from slam_backend.core.errors import BadFile, SolverFailure
 from slam_backend.core.graph import Factor, is_pose
 from slam_backend.io.linearized import Linearized, write_linearized
@@ -44,7 +45,7 @@ def inertial() -> tuple[list[Factor], gtsam.Values]:
 
 def test_factors_of_any_size_with_kernels_and_priors_give_gtsams_own_marginals(tmp_path: Path) -> None:
     factors, values = inertial()
-    write_linearized(tmp_path / "a.npz", factors, values, np.arange(2))
+    write_linearized(tmp_path / "a.npz", Fit(factors, values), np.arange(2))
     graph = gtsam.NonlinearFactorGraph()
     for each in factors:
         graph.add(each.factor)
@@ -58,13 +59,13 @@ def test_factors_of_any_size_with_kernels_and_priors_give_gtsams_own_marginals(t
 
 def test_equal_runs_give_equal_bytes(tmp_path: Path) -> None:
     for name in "ab":
-        write_linearized(tmp_path / f"{name}.npz", *inertial(), np.arange(2))
+        write_linearized(tmp_path / f"{name}.npz", Fit(*inertial()), np.arange(2))
     assert (tmp_path / "a.npz").read_bytes() == (tmp_path / "b.npz").read_bytes()
 
 
 def test_what_the_factors_do_not_determine_is_refused(tmp_path: Path) -> None:
     factors, values = inertial()
-    write_linearized(tmp_path / "a.npz", factors[:1], values, np.arange(2))
+    write_linearized(tmp_path / "a.npz", Fit(factors[:1], values), np.arange(2))
     found = Linearized(tmp_path / "a.npz")
     for index in (0, 7):
         with pytest.raises(SolverFailure, match=f"keyframe {index}"):
@@ -73,7 +74,7 @@ def test_what_the_factors_do_not_determine_is_refused(tmp_path: Path) -> None:
 
 def test_damage_is_one_line_that_names_the_file(tmp_path: Path) -> None:
     whole = tmp_path / "a.npz"
-    write_linearized(whole, *inertial(), np.arange(2))
+    write_linearized(whole, Fit(*inertial()), np.arange(2))
     data = whole.read_bytes()
     arrays = dict(np.load(whole))
     for n, damaged in enumerate((b"", b"no zip", data[:200], data[:-30], data[:120] + b"????" + data[124:])):
@@ -98,7 +99,7 @@ def test_damage_is_one_line_that_names_the_file(tmp_path: Path) -> None:
 
 def test_the_residuals_are_those_of_the_factors(tmp_path: Path) -> None:
     factors, values = inertial()
-    write_linearized(tmp_path / "a.npz", factors, values, np.arange(2))
+    write_linearized(tmp_path / "a.npz", Fit(factors, values), np.arange(2))
     found = Linearized(tmp_path / "a.npz")
     assert found.ids.tolist() == [each.id for each in factors]
     assert found.keys == [list(each.keys) for each in factors]

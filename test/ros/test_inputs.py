@@ -226,6 +226,7 @@ def test_diagnostics_say_how_everything_is(backend, peer, drive) -> None:
     assert 0 < float(values["update_ms_p50"]) <= float(values["update_ms_p99"])
     for name in ("correction_m", "correction_rad", "restarts", "revision", "incidents", "lost", "unwritten"):
         assert name in values
+    assert {"nis", "nis_bounds", "noise"} <= told["wheels"][2].keys()  # looked at on the way
     for n in range(20):
         alive["/odom"].publish(odometry(n, x=float("nan")))
     peer.until(lambda: told["wheels"][2].get("check/not_finite") == "20")
