@@ -59,6 +59,12 @@ class Case:
         return replace(self.graph, edges=_only(self.graph.edges, ~self.loops))
 
     @cached_property
+    def honest(self) -> "Case":
+        """With exactly the true loops."""
+        kept = ~self.loops | self.true
+        return Case(self.name, self.clean, self.true[kept], self.wrong[kept], self.truth)
+
+    @cached_property
     def loops(self) -> Mask:
         return loops_of(self.graph)
 

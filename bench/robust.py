@@ -2,6 +2,8 @@
 
 python -m bench robust                        what is promised, on a subset; some minutes
 python -m bench.robust [--all] [--keep F]     every strategy on a subset or on everything (hours), into docs/robust.md
+
+With a file to keep what has been measured it can be broken off at any time; `--told` writes what there is without measuring.
 """
 
 import json
@@ -15,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from bench.loops import GRAPHS, Case, aliased, injected, vo_loops
-from bench.strategies import Found, ours, played, strategies
+from bench.strategies import Found, Strategy, configured, played, strategies
 from bench.table import Row, markdown
 from slam_backend.core.backend import Backend
 from slam_backend.core.config import Config
@@ -31,113 +33,125 @@ EXPLANATION = (
 PAGE = Path(__file__).parents[1] / "docs/robust.md"
 BEGIN, END = "<!-- measured: begin -->", "<!-- measured: end -->"
 FRAMES = 50  # keyframes after which a loop that waited must have entered
-LONE = {"witness": {"lone": 0.95}}
+LONE = {"witness": {"lone": 0.5}}
 GROUPS, SIZE = 45, 5  # of wrong loops that agree, in each of two drives
 SHARES = (0.0, 0.1, 0.3, 0.5)
 SUBSET: dict[str, Any] = {"alphas": ("0.15",), "seeds": (None, 1)}
-Results = dict[str, dict[str, Found]]  # strategy -> case -> what came of it
 
 
-def rows(whole: bool = False) -> list[Row]:
+class Measured:
+    """What strategies did to cases, each measured once. kept: a file that remembers it, so that a run can be broken off."""
+
+    def __init__(self, kept: Path | None = None, only: bool = False) -> None:
+        """only: what the file has; all else is left out."""
+        self._kept, self._only = kept, only
+        self._found: dict[tuple[str, str], Found] = {}
+        for line in kept.read_text().splitlines() if kept and kept.is_file() else ():
+            strategy, case, numbers = json.loads(line)
+            self._found[strategy, case] = Found(**numbers)
+
+    def of(self, name: str, strategy: Strategy, these: Iterable[Case]) -> list[tuple[Case, Found]]:
+        """Of a strategy on each of some cases."""
+        for case in these:
+            if (name, case.name) not in self._found and not self._only:
+                self._found[name, case.name] = found = strategy(case)
+                self._remember(name, case, found)
+        return [(case, self._found[name, case.name]) for case in these if (name, case.name) in self._found]
+
+    def _remember(self, strategy: str, case: Case, found: Found) -> None:
+        print(f"{case.name} ({case.counted}), {strategy}: {found}", file=sys.stderr, flush=True)
+        if self._kept:
+            with self._kept.open("a") as file:
+                file.write(json.dumps([strategy, case.name, asdict(found)]) + "\n")
+
+
+def rows(whole: bool = False, measured: Measured | None = None) -> list[Row]:
     """What is promised. whole: on all data sets instead of some."""
-    some = {} if whole else SUBSET
+    measured, some = measured or Measured(), {} if whole else SUBSET
     found: list[Row] = []
     for sequence in ("00", "05"):
-        found += _promised(sequence, list(vo_loops((sequence,), **some)))
-    found += _alone(list(vo_loops(("07",), **some)))
+        found += _promised(sequence, list(vo_loops((sequence,), **some)), measured)
+    found += _alone(list(vo_loops(("07",), **some)), measured)
     for name, bound in (("intel", "<= 0.05"), ("M3500", "<= 0.2")):
-        found += _random(name, bound)
+        found += _random(name, bound, measured)
     return found + list(_aliasing())
 
 
-def _promised(sequence: str, these: list[Case]) -> Iterator[Row]:
-    if not these:
+def _promised(sequence: str, these: list[Case], measured: Measured) -> Iterator[Row]:
+    runs = measured.of("default", configured({}), these)
+    if not runs:
         return
-    name = f"KITTI {sequence}, {len(these)} data sets"
-    runs = [ours(case, {}) for case in these]
+    name = f"KITTI {sequence}, {len(runs)} data sets"
     yield from _kept(name, runs, 0.98)
-    ratio, run, case = max(
-        ((r.ate / c.ate_clean, r, c) for r, c in zip(runs, these, strict=True)), key=lambda t: t[0]
-    )
-    yield Row(
-        f"{name}: ATE",
-        f"{run.ate:.2f} m",
-        f"{case.ate_clean:.2f} m with exactly the true loops",
-        ratio,
-        "<= 1.05",
-    )
-    prompt, slowest = min(r.prompt for r in runs), max(r.slowest for r in runs)
+    case, run = max(runs, key=lambda pair: pair[1].ate / pair[0].ate_clean)
+    exactly = f"{case.ate_clean:.2f} m with exactly the true loops"
+    yield Row(f"{name}: ATE", f"{run.ate:.2f} m", exactly, run.ate / case.ate_clean, "<= 1.05")
+    prompt, slowest = min(r.prompt for _, r in runs), max(r.slowest for _, r in runs)
     yield Row(f"{name}: accepted at arrival", f"{prompt:.1%}", "", prompt, ">= 0.85")
     yield Row(f"{name}: slowest of the rest", f"{slowest:.0f} keyframes", "", slowest, f"<= {FRAMES}")
+    first = [case for case, _ in runs[:1]]
+    for (_, run), (_, alone) in zip(
+        runs, measured.of("default, true loops alone", _undisturbed, first), strict=False
+    ):
+        yield Row(
+            f"{name}: the same in a drive without wrong loops", f"{run.slowest:.0f} keyframes",
+            f"{alone.slowest:.0f} keyframes", run.slowest - alone.slowest, f"<= {FRAMES}",
+        )  # fmt: skip
     scale = Config().gate.odometry_scale
     for factor in (1 / 3, 3.0):
-        runs = [ours(case, {"gate": {"odometry_scale": factor * scale}}) for case in these]
-        yield from _kept(f"{name}, odometry noise x {factor:.2g}", runs, 0.95)
+        scaled = f"odometry noise x {factor:.2g}"
+        settings = {"gate": {"odometry_scale": factor * scale}}
+        if runs := measured.of(f"default, {scaled}", configured(settings), these):
+            yield from _kept(f"{name}, {scaled}", runs, 0.95)
 
 
-def _kept(name: str, runs: list[Found], recall: float) -> Iterator[Row]:
-    ever = max(r.ever for r in runs)
+def _undisturbed(case: Case) -> Found:
+    return configured({})(case.honest)
+
+
+def _kept(name: str, runs: list[tuple[Case, Found]], recall: float) -> Iterator[Row]:
+    ever = max(r.ever for _, r in runs)
     yield Row(f"{name}: wrong loops kept at any moment", f"{ever:.0f}", "", ever, "<= 0")
-    least = min(r.recall for r in runs)
+    least = min(r.recall for _, r in runs)
     yield Row(f"{name}: recall", f"{least:.1%}", "", least, f">= {recall}")
 
 
-def _alone(these: list[Case]) -> Iterator[Row]:
+def _alone(these: list[Case], measured: Measured) -> Iterator[Row]:
     """One or two true loops in the whole drive: nothing speaks for them."""
-    if not these:
-        return
-    name = f"KITTI 07, {len(these)} data sets"
-    runs = [ours(case, {}) for case in these]
-    ever = max(r.ever for r in runs)
-    yield Row(f"{name}: wrong loops kept at any moment", f"{ever:.0f}", "", ever, "<= 0")
-    worst = max(zip(runs, these, strict=True), key=lambda pair: pair[0].ate / pair[1].ate_odometry)
-    yield _drift(f"{name}: ATE", *worst, "ate_odometry", "of odometry alone")
-    told = [
-        loop.rule for case in these for loop in played(case, {}).tally.loops.values() if loop.label == "true"
-    ]
-    unseen = sum(rule == "witness/no_witness" for rule in told) / len(told)
-    yield Row(f"{name}: true loops whose verdict is no witness", f"{unseen:.0%}", "", unseen, ">= 1")
-    runs = [ours(case, LONE) for case in these]
-    ever, least = max(r.ever for r in runs), min(r.recall for r in runs)
-    yield Row(f"{name}, lone loops let in: wrong loops kept at any moment", f"{ever:.0f}", "", ever, "<= 0")
-    yield Row(f"{name}, lone loops let in: recall", f"{least:.0%}", "", least, ">= 1")
-    worst = max(zip(runs, these, strict=True), key=lambda pair: pair[0].ate / pair[1].ate_clean)
-    yield _drift(f"{name}, lone loops let in: ATE", *worst, "ate_clean", "with exactly the true loops")
+    if runs := measured.of("default", configured({}), these):
+        name = f"KITTI 07, {len(runs)} data sets"
+        ever = max(r.ever for _, r in runs)
+        yield Row(f"{name}: wrong loops kept at any moment", f"{ever:.0f}", "", ever, "<= 0")
+        case, run = max(runs, key=lambda pair: pair[1].ate / pair[0].ate_odometry)
+        yield _drift(f"{name}: ATE", run, case.ate_odometry, "of odometry alone")
+        unseen = min(r.unseen for _, r in runs)
+        yield Row(f"{name}: true loops whose verdict is no witness", f"{unseen:.0%}", "", unseen, ">= 1")
+    if runs := measured.of("default, lone loops let in", configured(LONE), these):
+        name = f"KITTI 07, {len(runs)} data sets, lone loops let in"
+        yield from _kept(name, runs, 1.0)
+        case, run = max(runs, key=lambda pair: pair[1].ate / pair[0].ate_clean)
+        yield _drift(f"{name}: ATE", run, case.ate_clean, "with exactly the true loops")
 
 
-def _drift(name: str, run: Found, case: Case, against: str, what: str) -> Row:
-    bound = getattr(case, against)
+def _drift(name: str, run: Found, bound: float, what: str) -> Row:
     return Row(name, f"{run.ate:.2f} m", f"{bound:.2f} m {what}", run.ate / bound, "<= 1.1")
 
 
-def _random(name: str, bound: str) -> Iterator[Row]:
-    clean = injected(name, 0.0)
-    if clean is None:
+def _random(name: str, bound: str, measured: Measured) -> Iterator[Row]:
+    these = [case for share in (0.0, 0.3, 0.5) if (case := injected(name, share)) is not None]
+    runs = measured.of("default", configured({}), these)
+    if len(runs) < len(these) or not runs:
         return
-    baseline = ours(clean, {})
-    for share in (0.3, 0.5):
-        case = injected(name, share)
-        assert case is not None
-        run = ours(case, {})
+    (_, clean), *others = runs
+    for case, run in others:
+        what = f"{case.name} ({case.counted})"
+        yield Row(f"{what}: ATE", f"{run.ate:.4f} m", f"{clean.ate:.4f} m clean", run.ate, bound)
         yield Row(
-            f"{case.name} ({case.counted}): ATE",
-            f"{run.ate:.4f} m",
-            f"{baseline.ate:.4f} m clean",
-            run.ate,
-            bound,
-        )
-        yield Row(
-            f"{case.name}: CPU", f"{run.seconds:.1f} s", f"{baseline.seconds:.1f} s clean", run.seconds / baseline.seconds, "<= 1.5"
+            f"{case.name}: CPU", f"{run.seconds:.1f} s", f"{clean.seconds:.1f} s clean", run.seconds / clean.seconds, "<= 1.5"
         )  # fmt: skip
         if name == "M3500":
             yield Row(f"{case.name}: verdict, p50", f"{run.p50:.1f} ms", "", run.p50, "<= 20")
             yield Row(f"{case.name}: verdict, p99", f"{run.p99:.1f} ms", "", run.p99, "<= 80")
-
-
-LONE = {"witness": {"lone": 0.95}}
-GROUPS, SIZE = 45, 5  # of wrong loops that agree, in each of two drives
-SHARES = (0.0, 0.1, 0.3, 0.5)
-Results = dict[str, dict[str, Found]]  # strategy -> case -> what came of it
 
 
 def _aliasing() -> Iterator[Row]:
@@ -190,57 +204,33 @@ def cases(whole: bool) -> Iterator[Case]:
                 yield case
 
 
-def measure(whole: bool, kept: Path | None) -> tuple[Results, dict[str, Case]]:
-    """Every strategy on every case. kept: a file that remembers what has been measured, so that it can be broken off."""
-    results: Results = {name: {} for name in strategies()}
-    for line in kept.read_text().splitlines() if kept and kept.is_file() else ():
-        strategy, case, numbers = json.loads(line)
-        results.setdefault(strategy, {})[case] = Found(**numbers)
-    found: dict[str, Case] = {}
-    for case in cases(whole):
-        found[case.name] = case
-        for name, strategy in strategies().items():
-            if case.name not in results[name]:
-                results[name][case.name] = strategy(case)
-                _remember(kept, name, case, results[name][case.name])
-    return results, found
-
-
-def _remember(kept: Path | None, strategy: str, case: Case, found: Found) -> None:
-    print(f"{case.name} ({case.counted}), {strategy}: {found}", file=sys.stderr, flush=True)
-    if kept:
-        with kept.open("a") as file:
-            file.write(json.dumps([strategy, case.name, asdict(found)]) + "\n")
-
-
-def tables(results: Results, found: dict[str, Case]) -> str:
-    """Per sequence the worst over its data sets, per graph each share of wrong loops."""
+def tables(whole: bool, measured: Measured) -> str:
+    """Every strategy on every case: per sequence the worst over its data sets, per graph each share of wrong loops."""
+    these = list(cases(whole))
+    runs = {name: measured.of(name, strategy, these) for name, strategy in strategies().items()}
     lines = []
-    for sequence in ("00", "05", "07"):
-        these = {name: case for name, case in found.items() if name.startswith(f"KITTI {sequence}")}
-        if these:
-            lines += _sequence(f"KITTI {sequence}", these, results)
-    for graph in GRAPHS:
-        these = {name: case for name, case in found.items() if name.startswith(f"{graph}, ")}
-        if these:
-            lines += _graph(graph, these, results)
+    for title in ("KITTI 00", "KITTI 05", "KITTI 07", *GRAPHS):
+        some = [case for case in these if case.name.startswith(f"{title}, ")]
+        names = {case.name for case in some}
+        found = {name: [r for case, r in pairs if case.name in names] for name, pairs in runs.items()}
+        if any(found.values()):
+            lines += _sequence(title, some, found) if title not in GRAPHS else _graph(title, some, found)
     return "\n".join(lines)
 
 
-def _sequence(title: str, these: dict[str, Case], results: Results) -> list[str]:
-    some = next(iter(these.values()))
+def _sequence(title: str, these: list[Case], found: dict[str, list[Found]]) -> list[str]:
+    clean = [case.ate_clean for case in these]
     lines = [
-        f"**{title}**, worst of {len(these)} data sets (ATE: odometry {some.ate_odometry:.2f} m, exactly the true loops "
-        f"{min(case.ate_clean for case in these.values()):.2f} to {max(case.ate_clean for case in these.values()):.2f} m)",
+        f"**{title}**, worst over the data sets (ATE: odometry {these[0].ate_odometry:.2f} m, exactly the true loops "
+        f"{min(clean):.2f} to {max(clean):.2f} m)",
         "",
-        "| strategy | precision | recall | wrong at the end | at any moment | at arrival | slowest, keyframes | ATE, m | CPU, s | verdict p50 / p99, ms |",
-        "|---|---|---|---|---|---|---|---|---|---|",
+        "| strategy | data sets | precision | recall | wrong at the end | at any moment | at arrival | slowest, keyframes | ATE, m | CPU, s | verdict p50 / p99, ms |",
+        "|---|---|---|---|---|---|---|---|---|---|---|",
     ]
-    for strategy, by_case in results.items():
-        runs = [by_case[name] for name in these if name in by_case]
+    for strategy, runs in found.items():
         if runs:
             lines.append(
-                f"| {strategy} | {min(r.precision for r in runs):.1%} | {min(r.recall for r in runs):.1%} | {max(r.wrong for r in runs)} | "
+                f"| {strategy} | {len(runs)} | {min(r.precision for r in runs):.1%} | {min(r.recall for r in runs):.1%} | {max(r.wrong for r in runs)} | "
                 f"{_number(max(r.ever for r in runs), '.0f')} | {_number(min(r.prompt for r in runs), '.0%')} | "
                 f"{_number(max(r.slowest for r in runs), '.0f')} | {max(r.ate for r in runs):.2f} | "
                 f"{np.mean([r.seconds for r in runs]):.1f} | {_latency(runs)} |"
@@ -248,17 +238,15 @@ def _sequence(title: str, these: dict[str, Case], results: Results) -> list[str]
     return [*lines, ""]
 
 
-def _graph(title: str, these: dict[str, Case], results: Results) -> list[str]:
-    shares = [name.partition(", ")[2] for name in these]
-    some = next(iter(these.values()))
+def _graph(title: str, these: list[Case], found: dict[str, list[Found]]) -> list[str]:
+    shares = [case.name.partition(", ")[2] for case in these]
     lines = [
-        f"**{title}**, {some.true.sum()} loops of its own; ATE to its optimum in m, wrong loops kept, recall, CPU in s (odometry: {some.ate_odometry:.2f} m)",
+        f"**{title}**, {these[0].true.sum()} loops of its own; ATE to its optimum in m, wrong loops kept, recall, CPU in s (odometry: {these[0].ate_odometry:.2f} m)",
         "",
         "| strategy | " + " | ".join(shares) + " | verdict p50 / p99, ms |",
         "|---" * (len(shares) + 2) + "|",
     ]
-    for strategy, by_case in results.items():
-        runs = [by_case[name] for name in these if name in by_case]
+    for strategy, runs in found.items():
         if len(runs) == len(these):
             cells = [f"{r.ate:.3f} m, {r.wrong} wrong, {r.recall:.1%}, {r.seconds:.1f} s" for r in runs]
             lines.append(f"| {strategy} | " + " | ".join(cells) + f" | {_latency(runs)} |")
@@ -286,10 +274,11 @@ def main() -> None:
     parser = ArgumentParser(description="Every strategy, into docs/robust.md.")
     parser.add_argument("--all", action="store_true", help="all data sets, masks and shares: hours")
     parser.add_argument("--keep", type=Path, help="a file that remembers what has been measured")
+    parser.add_argument("--told", action="store_true", help="only what that file has")
     given = parser.parse_args()
-    strategies_table = tables(*measure(given.all, given.keep))
-    promised = markdown(TITLE, EXPLANATION, rows(given.all)).partition("\n")[2]
-    write(f"{promised}\n{strategies_table}")
+    measured = Measured(given.keep, given.told)
+    promised = markdown(TITLE, EXPLANATION, rows(given.all, measured)).partition("\n")[2]
+    write(f"{promised}\n{tables(given.all, measured)}")
 
 
 if __name__ == "__main__":

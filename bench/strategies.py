@@ -29,7 +29,8 @@ KEPT = 0.5  # weight of a loop from which a kernel has kept it
 class Found:
     """What a strategy did to a case. wrong: kept at the end; ever: kept at some moment (nan: not followed).
 
-    prompt: share of the kept true loops that entered at arrival; slowest: keyframes of the slowest. latency: of a verdict, ms.
+    prompt: share of the kept true loops that entered at arrival; slowest: keyframes of the slowest; unseen: share of the true loops
+    of which it is said at the end that they have no witness. p50, p99: of a verdict, ms.
     """
 
     precision: float
@@ -42,6 +43,7 @@ class Found:
     seconds: float
     p50: float = nan
     p99: float = nan
+    unseen: float = nan
 
 
 class Timed:
@@ -103,6 +105,7 @@ def ours(case: Case, settings: dict[str, Any]) -> Found:
         tally.precision, tally.recall, tally.wrong_kept, tally.wrong_ever,
         float((delays == 0).mean()) if len(delays) else nan, float(delays.max(initial=0)),
         case.ate(backend.snapshot().trajectory), seconds, *np.percentile(latencies or [nan], (50, 99)).tolist(),
+        float(np.mean([loop.rule == "witness/no_witness" for loop in tally.loops.values() if loop.label == "true"] or [nan])),
     )  # fmt: skip
 
 
@@ -193,7 +196,7 @@ def strategies() -> dict[str, Strategy]:
         "none": {"robust": []},
         **{n: {"robust": [n]} for n in alone},
     }
-    found: dict[str, Strategy] = {name: _configured(settings) for name, settings in named.items()}
+    found: dict[str, Strategy] = {name: configured(settings) for name, settings in named.items()}
     return found | {
         "gtsam, Huber": bare_online("huber"),
         "gtsam, DCS": bare_online("dcs"),
@@ -201,5 +204,5 @@ def strategies() -> dict[str, Strategy]:
     }
 
 
-def _configured(settings: dict[str, Any]) -> Strategy:
+def configured(settings: dict[str, Any]) -> Strategy:
     return lambda case: ours(case, settings)
