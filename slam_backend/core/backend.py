@@ -620,6 +620,7 @@ class Backend:
                     self._decisions.append(told)
             decided = {each.id for each in decisions}
             self._undecided |= {id_: each for id_, each in passed.items() if id_ not in decided | kept}
+        self._editor.note(self._decisions)
         proposed, overruled = self._editor.respected(proposed, passed)
         self._decisions += overruled
         self._applier.apply(touched(proposed), passed)

@@ -73,6 +73,7 @@ class Editor:
         # without weights: what stages judge, and what a person has edited
         self._known: dict[str, Factor] = {}
         self._said: dict[str, Verdict] = {}  # of those: the last verdict that was not a person's
+        self._overruled: dict[str, str] = {}  # of those: why, where that is what was told last
         self._wanted: dict[
             str, bool
         ] = {}  # of those: whether it would be in the graph without a person's wish
@@ -145,11 +146,15 @@ class Editor:
     def note(self, decisions: Iterable[Decision]) -> None:
         """What others decided about factors counts again where a person's wish is taken back."""
         for each in decisions:
-            if each.id in self._known and each.stage != "edit":
+            if each.stage == "edit":
+                self._overruled[each.id] = each.reason
+            elif each.id in self._known:
                 self._said[each.id] = each.verdict
+                self._overruled.pop(each.id, None)
 
     def respected(self, delta: Delta, passed: Mapping[str, Decision]) -> tuple[Delta, list[Decision]]:
-        """The change that stages want, without what a person has decided otherwise; and the decisions that say so.
+        """The change that stages want, without what a person has decided otherwise; and the decisions that say so, once: a stage that
+        proposes the same again is told nothing new.
 
         passed: by id, why a factor may enter, told where it does not either.
         """
@@ -158,11 +163,14 @@ class Editor:
         self._wanted |= {factor.id: True for factor in delta.add} | dict.fromkeys(delta.remove, False)
         overruled = {f.id: f for f in delta.add if f.id in wishes.out or f.id in held}
         stays = [id_ for id_ in delta.remove if id_ in wishes.forced or id_ not in held]
-        decisions = []
-        for id_, factor in overruled.items():
-            decisions += [passed[id_]] if id_ in passed else []
-            decisions.append(self._decision(factor, "edited"))
-        decisions += [self._decision(self._known[id_], "edited") for id_ in stays if id_ in self._known]
+        decisions: list[Decision] = []
+        for id_ in (*overruled, *(id_ for id_ in stays if id_ in self._known)):
+            told = self._decision(self._known[id_], "edited")
+            before = passed.get(id_) if id_ in overruled else None
+            news = before is not None and before.verdict != self._said.get(id_)
+            if news or self._overruled.get(id_) != told.reason:
+                decisions += [told] if before is None else [before, told]
+        self.note(decisions)
         add = tuple(weighted(f, wishes.weights.get(f.id, 1.0)) for f in delta.add if f.id not in overruled)
         remove = tuple(id_ for id_ in delta.remove if id_ not in stays)
         return replace(delta, add=add, remove=remove), decisions

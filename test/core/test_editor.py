@@ -323,8 +323,10 @@ def test_what_is_forced_enters_and_stays(doubted):
     assert (about.verdict, about.reason) == ("restored", "forced")
     stage.rejects = [FIRST]
     assert last(backend.add(rest[0]), FIRST).reason == "forced"
+    stage.rejects = [FIRST]
+    assert last(backend.add(rest[1]), FIRST).reason == "forced"
     stage.wants = [FIRST]  # it changes its mind, for what is there already
-    backend.add(rest[1])
+    backend.add(rest[2])
     assert FIRST in backend.solver.factors
     asked(backend, "undo")
     assert FIRST in backend.solver.factors  # since the stage wants it by now
@@ -348,6 +350,8 @@ def test_what_is_disabled_stays_out_whatever_a_stage_says(doubted):
     assert FIRST not in backend.solver.factors
     assert last(updates, FIRST).verdict == "removed"
     assert [d.verdict for u in updates for d in u.decisions if d.id == FIRST] == ["accepted", "removed"]
+    stage.wants = [FIRST]
+    assert not [d for u in backend.add(rest[1]) for d in u.decisions if d.id == FIRST], "nothing new"
     asked(backend, "undo")
     assert FIRST in backend.solver.factors  # what the stage said meanwhile counts
 
