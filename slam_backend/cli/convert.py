@@ -14,7 +14,7 @@ def command(
         typer.Argument(
             metavar="OUT",
             help="Told by its extension. Graphs: .g2o .graph .toro .pyfg; trajectories: .tum .txt .kitti .euroc .csv; "
-            "of a run also .ply and .geojson",
+            "of a run also .ply, .geojson and .kml",
         ),
     ],
     rotation_information: Annotated[
@@ -28,7 +28,8 @@ def command(
         str | None,
         typer.Option(
             metavar="LAT,LON[,ALT[,YAW]]",
-            help="For .geojson: where the map's origin lies (degrees, m), and its x axis, degrees from east to north.",
+            help="For .geojson and .kml: where the map's origin lies (degrees, m), and its x axis, degrees from east to north; "
+            "without it, as the run's GNSS fixes have shown.",
         ),
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print what was done as JSON.")] = False,

@@ -4,7 +4,7 @@ import json
 import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
@@ -12,7 +12,7 @@ from ..core.errors import BadConfig, SlamError
 from .progress import Progress, progress, silent
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Callable, Mapping, Sequence
 
     from ..core.backend import Update
     from ..io.history import History
@@ -216,7 +216,9 @@ def _report(run: "Run", target: Path) -> None:
     for line in summary["damage"]:
         sys.stderr.write(f"damage: {line}\n")
     refused = {
-        rule: n for rule, n in summary["decisions"].items() if rule not in ("admit/unjudged", "settle/late")
+        rule: n
+        for rule, n in summary["decisions"].items()
+        if rule not in ("admit/unjudged", "settle/late", "doubt/expected")
     }
     for rule, n in refused.items():
         example = next(d for d in run.decisions if f"{d.stage}/{d.reason}" == rule)
@@ -230,4 +232,23 @@ def _report(run: "Run", target: Path) -> None:
         f"{cost['online']:.6g} online, {cost['final']:.6g} at the end; {timing['wall_s']:.1f} s "
         f"(update p50 {timing['update_ms']['p50']:.1f} ms, p99 {timing['update_ms']['p99']:.1f} ms)"
     )
+    if (earth := summary["earth"]) is not None:
+        typer.echo(_earth(earth))
     typer.echo(f"look at {target / 'trajectory.png'}; run hash {summary['run_hash'][:16]}")
+
+
+def _earth(told: "Mapping[str, Any]") -> str:
+    """How the map lies on the earth, how far the fixes are from it, and whether their noise is what they say."""
+    fixes = f"{told['fixes']['told']} fixes"
+    if told["map_T_earth"] is None:
+        return f"on the earth: unknown ({fixes}): {told['why']}"
+    line = f"on the earth: the map's x axis points {told['yaw']:.3f} rad from east; {fixes}"
+    for use, away in told["away"].items():
+        if away["horizontal"] is not None:
+            line += f", {use} {away['horizontal']:.2f} m away horizontally (rms)"
+    for source, nis in told["nis"].items():
+        if not nis["low"] <= nis["mean"] <= nis["high"]:
+            line += (
+                f"; '{source}' is {nis['noise_is']:.2g} times as far from what is expected as the noise says"
+            )
+    return line

@@ -1,15 +1,17 @@
-"""A finished run for other programs: PLY for point cloud viewers, GeoJSON for maps, and whatever `convert` can make of its files."""
+"""A finished run for other programs: PLY for point cloud viewers, GeoJSON and KML for maps, and whatever `convert` can make of its files."""
 
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
+from xml.sax.saxutils import escape
 
 import numpy as np
-import pymap3d
 
 from ..core.errors import BadConfig, BadFile
+from ..core.geometry import inverse_of, matrix_of
 from ..core.measurement import Array, format_stamp
+from ..core.sensors.gnss import geodetic
 from .formats import FORMATS, convert, endings
 from .rundir import FinishedRun
 
@@ -42,18 +44,19 @@ def export(run: FinishedRun, target: Path, origin: Origin | None = None) -> str:
     ending = target.suffix.lower()
     if ending == ".ply":
         write_ply(target, run)
-    elif ending == ".geojson":
-        if origin is None:
+    elif ending in WRITERS:
+        placed = _placed(run) if origin is None else _given(origin)
+        if placed is None:
             raise BadConfig(
-                f"{target}: GeoJSON is in degrees: say where the map's origin lies with --origin LAT,LON"
+                f"{target}: is in degrees, and the run does not know where it lies on the earth: say so with --origin LAT,LON"
             )
-        write_geojson(target, run, origin)
+        WRITERS[ending](target, run, placed)
     elif target.name.lower().endswith(endings("graph")):
         return convert(run.path / "graph.g2o", target)
     elif target.name.lower().endswith(endings("trajectory")):
         return convert(run.path / "trajectory.tum", target)
     else:
-        known = ", ".join([*(end for form in FORMATS for end in form.extensions), ".ply", ".geojson"])
+        known = ", ".join([*(end for form in FORMATS for end in form.extensions), ".ply", *WRITERS])
         raise BadFile(f"{target}: cannot tell what to write from its name: end it in {known}")
     return (
         f"{run.path} -> {target} ({ending[1:]}): {len(run.trajectory)} poses, {len(run.landmarks)} landmarks"
@@ -81,7 +84,29 @@ def _vertex(point: Array, colour: Sequence[int]) -> str:
     return " ".join([*map(repr, point.tolist()), *map(str, colour)])
 
 
-def write_geojson(path: Path, run: FinishedRun, origin: Origin) -> None:
+class Placed(NamedTuple):
+    """Where the map lies: latitude, longitude (degrees), altitude (m) of an origin, pose: (4, 4) of the map in east, north, up there."""
+
+    origin: tuple[float, float, float]
+    pose: Array
+
+
+def _given(origin: Origin) -> Placed:
+    c, s = np.cos(np.radians(origin.yaw)), np.sin(np.radians(origin.yaw))
+    turned = np.eye(4)
+    turned[:2, :2] = [[c, -s], [s, c]]
+    return Placed(origin[:3], turned)
+
+
+def _placed(run: FinishedRun) -> Placed | None:
+    """As the fixes of the run have shown it."""
+    earth = run.summary.get("earth")
+    if earth is None or earth["map_T_earth"] is None:
+        return None
+    return Placed(tuple(earth["origin"]), inverse_of(matrix_of(np.array(earth["map_T_earth"]))))
+
+
+def write_geojson(path: Path, run: FinishedRun, origin: Placed) -> None:
     """RFC 7946: the path as a LineString with the stamps of its points, each landmark as a Point."""
     line = _degrees(run.trajectory.sevens[:, :3], origin)
     stamps = [format_stamp(stamp) for stamp in run.trajectory.stamps.tolist()]
@@ -101,12 +126,33 @@ def _feature(
     return {"type": "Feature", "geometry": geometry, "properties": properties}
 
 
-def _degrees(points: Array, origin: Origin) -> list[list[float]]:
+def write_kml(path: Path, run: FinishedRun, origin: Placed) -> None:
+    """OGC KML 2.3: the path as a LineString, each landmark as a Point; altitudes only of a run in 3-D, else on the ground."""
+    mode = "absolute" if run.config.space == "3d" else "clampToGround"
+
+    def placemark(name: str, kind: str, places: list[list[float]]) -> str:
+        words = " ".join(f"{x!r},{y!r},{z!r}" for x, y, z in places)
+        shape = f"<{kind}><altitudeMode>{mode}</altitudeMode><coordinates>{words}</coordinates></{kind}>"
+        return f"<Placemark><name>{escape(name)}</name>{shape}</Placemark>"
+
+    marks = [placemark("trajectory", "LineString", _degrees(run.trajectory.sevens[:, :3], origin))]
+    points = np.array(list(run.landmarks.values())).reshape(-1, 3)
+    marks += [
+        placemark(name, "Point", [place])
+        for name, place in zip(run.landmarks, _degrees(points, origin), strict=True)
+    ]
+    head = '<?xml version="1.0" encoding="UTF-8"?>\n<kml xmlns="http://www.opengis.net/kml/2.2"><Document>'
+    path.write_text("\n".join([head, *marks, "</Document></kml>", ""]), encoding="utf-8")
+
+
+WRITERS: Mapping[str, Callable[[Path, FinishedRun, Placed], None]] = {
+    ".geojson": write_geojson,
+    ".kml": write_kml,
+}
+
+
+def _degrees(points: Array, origin: Placed) -> list[list[float]]:
     """(N, 3) m in the map to longitude, latitude (degrees), altitude (m)."""
-    c, s = np.cos(np.radians(origin.yaw)), np.sin(np.radians(origin.yaw))
-    east, north = c * points[:, 0] - s * points[:, 1], s * points[:, 0] + c * points[:, 1]
-    latitude, longitude, altitude = pymap3d.enu2geodetic(
-        east, north, points[:, 2], origin.latitude, origin.longitude, origin.altitude
-    )
-    rows = zip(np.atleast_1d(longitude), np.atleast_1d(latitude), np.atleast_1d(altitude), strict=True)
-    return [[round(float(x), DECIMALS), round(float(y), DECIMALS), round(float(z), 4)] for x, y, z in rows]
+    on_earth = points @ origin.pose[:3, :3].T + origin.pose[:3, 3]
+    rows = geodetic(on_earth, origin.origin)[:, [1, 0, 2]].tolist()
+    return [[round(x, DECIMALS), round(y, DECIMALS), round(z, 4)] for x, y, z in rows]

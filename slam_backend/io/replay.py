@@ -31,6 +31,7 @@ from ..core.space import SPACES, Space
 from ..core.trajectory import Snapshot, Trajectory
 from .configfile import configured, load_config
 from .discover import discover
+from .earth import on_earth
 from .edits import NONE, Edits, kept
 from .inputs import GraphInput, Inputs, open_inputs
 from .mapfile import read_map
@@ -365,6 +366,7 @@ class Result:
                 "loops_probation": loops.get("probation", 0),
                 "loops_refused": loops.get("refused", 0) + loops.get("removed", 0),
             },
+            "earth": on_earth(self),
             "edits": len(run.edits),
             "decisions": self.decisions.by_rule(),
             "cost": {

@@ -22,6 +22,8 @@ from ..core.query import Unknown
 from ..core.space import SPACES, Space
 from ..core.trajectory import Stamps, Trajectory
 from .configfile import load_config, write_yaml
+from .earth import NAME as FIXES
+from .earth import write_fixes
 from .edits import NAME as EDITS
 from .edits import Edits, arrivals, read_edits, write_edits
 from .export import pose_graph
@@ -46,6 +48,7 @@ ALIKE = 1e-6  # m and of quaternions; between replays on different machines
 RESULT_BAG = "run.mcap"
 INPUTS = "inputs"  # a folder of symbolic links
 DRAWN = ("trajectory.png", "report.html", "unguarded.tum", HISTORY, RESULT_BAG)  # by the command line
+MAYBE = (*DRAWN, FIXES)  # files that not every run has
 
 
 def write_run(result: Result, out: Path | str) -> None:
@@ -53,7 +56,7 @@ def write_run(result: Result, out: Path | str) -> None:
     out = Path(out)
     prepare(out)
     out.mkdir(parents=True, exist_ok=True)
-    for stale in ("summary.json", *DRAWN):  # the summary comes last, and says that the run is whole
+    for stale in ("summary.json", *MAYBE):  # the summary comes last, and says that the run is whole
         (out / stale).unlink(missing_ok=True)
     for link in _links(out):
         link.unlink()
@@ -72,6 +75,8 @@ def write_run(result: Result, out: Path | str) -> None:
     write_yaml(out / "config.yaml", result.run.config)
     write_edits(out / EDITS, result.run.edits)
     write_map(out / MAP, result.run.backend.saved(result.run.online, result.summary["run_hash"]))
+    if (compared := result.run.backend.compared(snapshot)) is not None:
+        write_fixes(out / FIXES, compared)
     summary = json.dumps(result.summary, indent=1)
     (out / "summary.json").write_text(summary + "\n", encoding="utf-8")
 
@@ -80,7 +85,7 @@ def replace_run(out: Path, by: Path) -> None:
     """Put the files of one run in the place of another's, on the same disk. Its edits come first: with them and the summary, which
     comes last and names the inputs, a run that was broken off in between can be written again.
     """
-    names = [name for name in (EDITS, *FILES, *DRAWN) if name != "summary.json"]
+    names = [name for name in (EDITS, *FILES, *MAYBE) if name != "summary.json"]
     for name in (*names, "summary.json"):
         if (by / name).exists():
             (by / name).replace(out / name)
@@ -103,7 +108,7 @@ def prepare(out: Path) -> None:
 
 def _is_run(out: Path) -> bool:
     """Whether a directory holds nothing but a run, whole or broken off."""
-    known = {*FILES, *DRAWN, EDITS, *([INPUTS] if all(path.is_symlink() for path in _links(out)) else [])}
+    known = {*FILES, *MAYBE, EDITS, *([INPUTS] if all(path.is_symlink() for path in _links(out)) else [])}
     if any(path.name not in known for path in out.iterdir()):
         return False
     try:
