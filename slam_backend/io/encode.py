@@ -151,6 +151,18 @@ def _transform(message: _Bytes, stamp: int, frame: str, child: str, seven: Array
     message.doubles(seven, 7)
 
 
+def encode_fix(stamp: int, frame: str, place: ArrayLike, covariance: ArrayLike) -> bytes:
+    """sensor_msgs/NavSatFix with a fix of GPS. place: latitude, longitude (degrees), altitude (m); covariance: (3, 3), known."""
+    message = _Bytes()
+    message.header(stamp, frame)
+    message.add(pack("<b", 0))  # STATUS_FIX
+    message.add(pack("<H", 1), 2)  # SERVICE_GPS
+    message.doubles(place, 3)
+    message.doubles(covariance, 9)
+    message.add(pack("<B", 3))  # COVARIANCE_TYPE_KNOWN
+    return message.finish()
+
+
 def encode_diagnostics(stamp: int, statuses: Collection[Status]) -> bytes:
     """diagnostic_msgs/msg/DiagnosticArray."""
     message = _Bytes()

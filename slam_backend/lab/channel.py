@@ -7,12 +7,13 @@ from numpy.random import Generator
 
 from ..core.inertial import ImuSample
 from ..core.measurement import SECOND, Measurement
+from ..core.sensors.gnss import Fix
 from ..core.sensors.landmark import LandmarkObservation
 from ..core.sensors.odometry import OdometryPose
 from ..core.sensors.relative import RelativePose
 from .options import Options
 
-Content = OdometryPose | RelativePose | ImuSample | tuple[LandmarkObservation, ...]
+Content = OdometryPose | RelativePose | Fix | ImuSample | tuple[LandmarkObservation, ...]
 ECHO = 1_000_000  # ns from a message to its duplicate
 
 

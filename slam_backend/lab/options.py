@@ -36,6 +36,12 @@ class Options:
     accelerometer_density: float = 5e-3  # m/s^2/sqrt(Hz), white noise
     accelerometer_walk: float = 5e-4  # m/s^3/sqrt(Hz), of its bias
     accelerometer_bias: float = 0.05  # m/s^2, standard deviation when switched on
+    gnss_every: int = 0  # odometry messages from one fix to the next; 0: there is no receiver
+    gnss_sigma: float = 0.5  # m, on each axis
+    gnss_yaw: float = 2.0  # rad: of the map in east, north, up, which nobody knows
+    gnss_arm: float = 0.5  # m: how far before, beside and above the base the antenna is
+    gnss_outage_start: float = 0.0  # s after the start: there is no fix from here ...
+    gnss_outage: float = 0.0  # ... for this many seconds
     dropout: float = 0.0  # fraction of the messages that never arrive
     silence_start: float = 0.0  # s after the start: nothing that is stamped from here ...
     silence: float = 0.0  # ... for this many seconds arrives
@@ -69,6 +75,7 @@ class Options:
             "accelerometer_density",
             "accelerometer_walk",
             "accelerometer_bias",
+            "gnss_sigma",
         ):
             if getattr(self, name) == 0:
                 raise BadConfig(f"{name}: must be greater than 0")

@@ -7,7 +7,8 @@ import numpy as np
 from numpy.random import Generator
 
 from ..core.geometry import covariance_to_ros, inverse_of, seven_of_matrix
-from ..core.measurement import Array, frozen
+from ..core.measurement import SECOND, Array, frozen
+from ..core.sensors.gnss import Fix, geodetic
 from ..core.sensors.landmark import LandmarkObservation
 from ..core.sensors.odometry import STILL, UNKNOWN, OdometryPose
 from ..core.sensors.relative import RelativePose
@@ -15,6 +16,8 @@ from .options import Options
 from .world import chain, exp_of
 
 BASE = "base"
+ANTENNA = "antenna"
+ORIGIN = (48.7, 9.1, 400.0)  # of the map on the earth: degrees, degrees, m
 CAMERA = "camera"  # the frame of the sensor that sees landmarks
 LOOP_AFTER = 50  # messages: what was seen more recently is motion, not a return
 LANDMARKS_EVERY = 5  # odometry messages
@@ -136,3 +139,26 @@ def sightings(
                 LandmarkObservation(stamp, "landmarks", frame, str(n), "position", frozen(point), covariance)
                 for n, point in zip(ids, seen, strict=True)
             )
+
+
+def arm_of(options: Options) -> Array:
+    """(3,) m of the antenna in the base."""
+    return options.gnss_arm * np.array([1.0, -0.5, 2.0])
+
+
+def on_earth(options: Options) -> Array:
+    """(4, 4) `earth_T_map`: the map lies level at ORIGIN, turned."""
+    return exp_of(np.array([0.0, 0.0, options.gnss_yaw, 0.0, 0.0, 0.0]))
+
+
+def fixes(truth: Array, stamps: list[int], options: Options, rng: Generator) -> Iterator[Fix]:
+    """Where the antenna of (N, 4, 4) true poses is on the earth, with noise; none during the outage."""
+    poses = on_earth(options) @ truth[:: options.gnss_every]
+    antennas = poses[:, :3, :3] @ arm_of(options) + poses[:, :3, 3]
+    noisy = antennas + options.gnss_sigma * rng.standard_normal(antennas.shape)
+    covariance = frozen(np.eye(3) * options.gnss_sigma**2)
+    begin = stamps[0] + round(options.gnss_outage_start * SECOND)
+    silent = range(begin, begin + round(options.gnss_outage * SECOND))
+    for stamp, place in zip(stamps[:: options.gnss_every], geodetic(noisy, ORIGIN), strict=True):
+        if stamp not in silent:
+            yield Fix(stamp, "gps", ANTENNA, frozen(place), covariance)

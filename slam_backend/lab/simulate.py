@@ -17,10 +17,11 @@ from ..core.errors import BadConfig
 from ..core.geometry import inverse_of, seven_of_matrix
 from ..core.inertial import ImuSample
 from ..core.measurement import SECOND, Array, Measurement, format_stamp, frozen
+from ..core.sensors.gnss import Fix
 from ..core.sensors.odometry import STILL, UNKNOWN, OdometryPose
 from ..core.sensors.relative import RelativePose
 from ..io.bags import write_bag
-from ..io.encode import encode_cloud, encode_imu, encode_odometry, encode_transforms
+from ..io.encode import encode_cloud, encode_fix, encode_imu, encode_odometry, encode_transforms
 from ..io.formats import tum
 from ..io.formats.trajectory import Trajectory
 from ..io.records import Record
@@ -33,9 +34,17 @@ from .world import SCENARIOS, Scenario, chain, exp_of
 __all__ = ["SCENARIOS", "Options", "Simulation", "Written", "simulate", "write_simulation"]
 
 START = 1_700_000_000 * SECOND
+FIX = "sensor_msgs/msg/NavSatFix"
 ODOMETRY, CLOUD, IMU = "nav_msgs/msg/Odometry", "sensor_msgs/msg/PointCloud2", "sensor_msgs/msg/Imu"
 PARTS = ("gyroscope", "accelerometer")
-LATENCY = {"/truth": 0, "/odom": 1_000_000, "/loops": 5_000_000, "/landmarks": 50_000_000, "/imu": 0}  # ns
+LATENCY = {
+    "/truth": 0,
+    "/odom": 1_000_000,
+    "/loops": 5_000_000,
+    "/landmarks": 50_000_000,
+    "/imu": 0,
+    "/fix": 80_000_000,
+}  # ns
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -81,7 +90,7 @@ def simulate(scenario: str, seed: int = 0, options: Options = Options()) -> Simu
         raise BadConfig(f"there is no scenario '{scenario}'; known: {', '.join(SCENARIOS)}")
     world = SCENARIOS[scenario]
     # One stream for each cause of chance: a change of the loops leaves the odometry as it was.
-    *chances, for_channel, for_imu = np.random.default_rng(seed).spawn(8)
+    *chances, for_channel, for_imu, for_gnss = np.random.default_rng(seed).spawn(9)
     truth = chain(exp_of(world.path(options.poses, chances[0])))
     count = world.landmarks if options.landmarks is None else options.landmarks
     landmarks = world.place(truth, count, chances[1])
@@ -91,6 +100,10 @@ def simulate(scenario: str, seed: int = 0, options: Options = Options()) -> Simu
     if options.imu_rate:
         samples = imu_messages(truth, stamps, options, sensing.BASE, for_imu)
         messages = chain_of(messages, (_sent("/imu", sample) for sample in samples))
+    if options.gnss_every:
+        messages = chain_of(
+            messages, (_sent("/fix", fix) for fix in sensing.fixes(truth, stamps, options, for_gnss))
+        )
     lost: Counter[str] = Counter()
 
     def counted(what: str) -> None:
@@ -120,7 +133,7 @@ def _messages(
         yield Sent(seen[0].stamp + LATENCY["/landmarks"], "/landmarks", seen)
 
 
-def _sent(topic: str, item: OdometryPose | RelativePose | ImuSample) -> Sent:
+def _sent(topic: str, item: OdometryPose | RelativePose | ImuSample | Fix) -> Sent:
     return Sent(item.stamp + LATENCY[topic], topic, item)
 
 
@@ -143,6 +156,10 @@ def _record(sent: Sent) -> Record:
     if isinstance(item, ImuSample):
         felt = (item.rate, item.acceleration, item.rate_covariance, item.acceleration_covariance)
         return Record(sent.topic, IMU, sent.arrival, encode_imu(item.stamp, item.frame, *felt))
+    if isinstance(item, Fix):
+        return Record(
+            sent.topic, FIX, sent.arrival, encode_fix(item.stamp, item.frame, item.place, item.covariance)
+        )
     if isinstance(item, OdometryPose):
         frames, noise = (item.frame, item.child), (item.covariance, item.twist, item.twist_covariance)
     else:
@@ -177,8 +194,12 @@ def _settings(world: Scenario, options: Options, topics: set[str]) -> dict[str, 
         }
         | {f"sigma_{part}_bias": getattr(options, f"{part}_bias") for part in PARTS},
     }
+    sources["gps"] = {"kind": "gnss", "topic": "/fix"}
     present = {name: source for name, source in sources.items() if source["topic"] in topics}
-    extrinsics = {} if world.camera is None else {"extrinsics": {sensing.CAMERA: list(world.camera)}}
+    mounts = {} if world.camera is None else {sensing.CAMERA: list(world.camera)}
+    if "/fix" in topics:
+        mounts[sensing.ANTENNA] = [*sensing.arm_of(options).tolist(), 0.0, 0.0, 0.0]
+    extrinsics = {"extrinsics": mounts} if mounts else {}
     space = "3d" if "/imu" in topics else world.space
     head = {"space": space, "base_frame": sensing.BASE, "keyframes": {"every": True}}
     settings = {**head, **extrinsics, "sources": list(present), **present}
