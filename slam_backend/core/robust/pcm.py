@@ -20,6 +20,7 @@ from .clique import LargestClique
 from .paths import Path, Paths
 from .stage import Judged
 
+NAMED = 20  # loops that a verdict names
 AXES = {
     "2d": [3, 4, 2],
     "3d": [0, 1, 2, 3, 4, 5],
@@ -75,9 +76,17 @@ class Pcm:
         agrees = f"agrees with {with_it} of the {others} others in the largest set that agrees"
         if others < self._config.smallest - 1:
             agrees += f"; {self._config.smallest} are needed"
-        more = {} if self._clique.exact else {"exact": False}
-        reason = "clique" if verdict in ("accepted", "restored") else "outside_clique"
-        return _decision(self._loops[n], verdict, reason, agrees, with_it, others, **more)
+        more: dict[str, object] = {} if self._clique.exact else {"exact": False}
+        if verdict in ("accepted", "restored"):
+            return _decision(self._loops[n], verdict, "clique", agrees, with_it, others, **more)
+        if with_it < others:
+            more["absent"] = self._absent(n)
+        return _decision(self._loops[n], verdict, "outside_clique", agrees, with_it, others, **more)
+
+    def _absent(self, n: int) -> list[str]:
+        """The smallest set of the members without which it agrees with all others of them; some, where they are many."""
+        against = [m for m in sorted(self._clique.members) if not self._clique.neighbours(n) >> m & 1]
+        return [self._loops[m].id for m in against[:NAMED]]
 
 
 @dataclass(slots=True)

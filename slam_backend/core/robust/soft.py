@@ -7,6 +7,7 @@ neighbourhood: from a drifted start true loops lie outside of it as well as wron
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from math import sqrt
 from typing import Any
 
 import gtsam
@@ -37,6 +38,7 @@ class Soft:
     def __init__(self, stage: str, paths: Paths, kernel: Any, weight: Callable[[float], float]) -> None:
         """kernel: one of gtsam's m-estimators. weight: of a loop, 0 to 1, by its squared Mahalanobis distance."""
         self._stage, self._paths, self._kernel, self._weight = stage, paths, kernel, weight
+        self._half = _halved(weight)
         self._loops: dict[str, Loop] = {}
         self._turn: list[str] = []  # to be looked at, the next one last
 
@@ -49,8 +51,7 @@ class Soft:
             loop = Loop(replace(factor, factor=made), np.asarray(noise.R()))
             self._loops[factor.id] = loop
             add.append(loop.factor)
-            weight = self._weight(self._distance(loop, estimate))
-            decisions.append(self._told(loop, "accepted", "weighed", weight))
+            decisions.append(self._told(loop, "accepted", "weighed", self._distance(loop, estimate)))
         return Delta(tuple(add), proposed.remove, proposed.values), tuple(decisions)
 
     def review(self, estimate: Estimate) -> Judged:
@@ -65,15 +66,14 @@ class Soft:
 
     def _turned(self, loop: Loop, estimate: Estimate) -> list[Decision]:
         """What there is to tell of one whose weight has crossed the half."""
-        weight = self._weight(self._distance(loop, estimate))
-        if (weight >= HALF) == loop.counts:
+        distance = self._distance(loop, estimate)
+        counts = self._weight(distance) >= HALF
+        if counts == loop.counts:
             return []
-        loop.counts = weight >= HALF
-        return [
-            self._told(loop, "restored", "weighs_again", weight)
-            if loop.counts
-            else self._told(loop, "probation", "weighs_little", weight)
-        ]
+        loop.counts = counts
+        if counts:
+            return [self._told(loop, "restored", "weighs_again", distance)]
+        return [self._told(loop, "probation", "weighs_little", distance)]
 
     def _distance(self, loop: Loop, estimate: Estimate) -> float:
         """Squared, in standard deviations."""
@@ -82,9 +82,26 @@ class Soft:
         whitened = loop.root @ self._paths.space.logmap(away)
         return float(whitened @ whitened)
 
-    def _told(self, loop: Loop, verdict: Verdict, reason: str, weight: float) -> Decision:
-        factor = loop.factor
+    def _told(self, loop: Loop, verdict: Verdict, reason: str, distance: float) -> Decision:
+        """With what would let it count, where it does not."""
+        factor, weight = loop.factor, self._weight(distance)
+        words = f"its weight at the estimate is {weight:.3g}"
+        basis: dict[str, Any] = {"distance": distance}
+        if weight < HALF:
+            larger = sqrt(distance / self._half)
+            words += f"; would count if its own noise were {larger:.3g} times larger"
+            basis["would_pass"] = {"loop": larger}
         return Decision(
-            factor.stamp, factor.id, factor.source, verdict, self._stage, reason,
-            f"its weight at the estimate is {weight:.3g}", weight, HALF, factor.stamps,
+            factor.stamp, factor.id, factor.source, verdict, self._stage, reason, words, weight, HALF, factor.stamps, basis=basis,
         )  # fmt: skip
+
+
+def _halved(weight: Callable[[float], float]) -> float:
+    """The largest distance at which a weight is a half at least."""
+    low, high = 0.0, 1.0
+    while weight(high) >= HALF:
+        low, high = high, 2 * high
+    for _ in range(60):
+        middle = (low + high) / 2
+        low, high = (middle, high) if weight(middle) >= HALF else (low, middle)
+    return low

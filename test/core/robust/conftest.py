@@ -90,8 +90,13 @@ class Drive:
         return RelativePose(max(stamps), "edges", *stamps, "", "", seven, unstated, information)
 
 
+def vertices(loop: RelativePose | Decision) -> tuple[int, ...]:
+    """Its two keyframes."""
+    return tuple(map(vertex, loop.ends or ()))
+
+
 def ends(loops: list[RelativePose]) -> set[tuple[int, int]]:
-    return {tuple(map(vertex, loop.ends)) for loop in loops}
+    return {vertices(loop) for loop in loops}
 
 
 @pytest.fixture(params=["2d", "3d"])

@@ -6,11 +6,12 @@ import pytest
 
 from slam_backend.core.config import Config
 from slam_backend.core.graph import Delta, Factor, keyframe
+from slam_backend.core.measurement import SECOND
 from slam_backend.core.robust.paths import Paths
 from slam_backend.core.robust.pcm import Cycles
 from slam_backend.core.space import SPACES
 
-from .conftest import ends
+from .conftest import ends, vertices
 
 
 def test_the_largest_set_that_agrees_stays_and_the_rest_does_not(drive):
@@ -29,10 +30,16 @@ def test_a_larger_set_that_comes_later_takes_the_place_of_the_first(drive):
     wrong = [drive._edge(30 + k, 10 + k, leap) for k in (0, 4)]
     back = drive.truth[34].between(drive.truth[30])
     wrong[1] = drive._edge(34, 14, back.compose(leap).compose(drive.truth[10].between(drive.truth[14])))
-    ended = drive.run([*wrong, *drive.true(5, 5)], robust=["pcm"])
-    assert ended.kept == ends(drive.true(5, 5))
+    true = drive.true(5, 5)
+    ended = drive.run([*wrong, *true], robust=["pcm"])
+    assert ended.kept == ends(true)
     told = [d.verdict for d in ended.decisions if d.ends == wrong[1].ends]
     assert told == ["accepted", "removed"]
+    absent = set(ended.last[vertices(wrong[1])].basis["absent"])
+    three = [loop for loop in true if f"edges/{loop.stamp // SECOND}.000000000/1" in absent]
+    assert three == true[:3], "those that had come"
+    others = [loop for loop in true if loop not in three]
+    assert drive.run([*wrong, *others], robust=["pcm"]).kept == ends(wrong), "without those it is in"
 
 
 def test_a_lone_loop_waits_and_one_may_be_enough_if_the_settings_say_so(drive):
