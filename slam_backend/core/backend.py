@@ -488,6 +488,7 @@ class Backend:
             self._gauge,
             DATUM in self.solver.factors,
             self._stretch,
+            self._imu == self._driver,
         )
 
     def _takes(self, fix: Fix) -> bool:

@@ -27,7 +27,7 @@ class Context:
     origin: latitude, longitude, altitude; None before the first fix.
     gauge: key -> id of the factor that holds its component and may be replaced; None where something else holds it, or will.
     has_datum: the earth stays where it is in the map.
-    stretch: what the IMU measured from the keyframe before to this one.
+    stretch: what the IMU measured from the keyframe before to this one. by_imu: nothing else tells the motion.
     """
 
     space: Space
@@ -44,6 +44,7 @@ class Context:
     gauge: Callable[[int], str | None] = lambda _: None
     has_datum: bool = False
     stretch: Stretch | None = None
+    by_imu: bool = False
 
     def known(self, key: int) -> bool:
         """Whether a variable is in the graph, or about to enter."""

@@ -25,6 +25,7 @@ INTEGRATION = (
 PERIOD = 0.01  # s between samples, before two of them have told
 STILL_RATE, STILL_ACCELERATION = 0.006, 0.06  # rad/s, m/s^2: largest standard deviations of an IMU at rest
 LARGEST_BIAS = 0.1  # rad/s: a mean rate that may still be the bias of an IMU at rest
+STRAIGHT = 1e-3  # relative change of a slope that is only rounding
 ENOUGH = 5  # samples, to tell by their looks whether the robot stands still
 ODD = 0.5  # of gravity: what the first samples may differ from it
 SIDEWAYS = 0.8  # rad: a robot is not tilted so much where it starts; an IMU whose mounting nobody told is
@@ -109,6 +110,7 @@ class Inertial:
         self._at = 0  # stamp up to which it goes
         self._flaw = ""
         self._bias = Bias()  # last believed
+        self._slope, self._straight = 0.0, 0  # of the vertical acceleration, per ns; ns
         self._decisions: list[Decision] = []
 
     def take_decisions(self) -> list[Decision]:
@@ -123,11 +125,19 @@ class Inertial:
             self._mount, self._params = mount, None
         if self._from is None:
             self._collect(sample)
+        self._note_straight(sample, self._samples[-1] if self._samples else self._before or sample)
         self._samples.append(sample)
         if len(self._samples) > KEPT:
             self._integrate(self._samples[KEPT // 2].stamp)
             self._drop(KEPT // 2)
             self._cuttable = self._at
+
+    def _note_straight(self, sample: ImuSample, before: ImuSample) -> None:
+        """For how long (ns) samples have been lying on a straight line that is not level: somebody filled a gap with them."""
+        elapsed, last = sample.stamp - before.stamp, self._slope
+        self._slope = float(sample.acceleration[2] - before.acceleration[2]) / elapsed if elapsed > 0 else 0.0
+        on = self._slope != 0 and abs(self._slope - last) <= STRAIGHT * abs(self._slope)
+        self._straight = self._straight + elapsed if on else 0
 
     def _collect(self, sample: ImuSample) -> None:
         """Before the first keyframe: the samples of the last seconds, without a gap between them."""
@@ -229,6 +239,8 @@ class Inertial:
         elif seconds > 0:
             if self._is_saturated(sample):
                 self._flaw = "imu/saturated"
+            if self._straight > self._config.max_gap * SECOND:
+                self._flaw = "imu/interpolated"
             assert self._measured is not None
             self._measured.integrateMeasurement(sample.acceleration, sample.rate, seconds)
             self._at = until

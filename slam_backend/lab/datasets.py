@@ -42,6 +42,7 @@ from ..io.formats.trajectory import Trajectory
 from ..io.records import Record
 from . import mrclam, pose_graphs, victoria_raw
 from .gtsam_data import Content, example, lifted, planar, rows, symmetric
+from .kitti import kitti_imu_gnss
 from .matlab import read_arrays
 from .simulate import CLOUD, ODOMETRY, START, beside
 from .world import chain
@@ -190,6 +191,9 @@ DATASETS: Mapping[str, Dataset] = {
     ),
     "plaza2": Dataset(
         "a lawn mower, 7 min: 4,090 poses on /odom, 1,816 ranges to 4 beacons on /ranges; 2-D", partial(_plaza, "Plaza2")
+    ),
+    "kitti_imu_gnss": Dataset(
+        "a car in a town, 8 min: 46,968 samples of an IMU on /imu, 470 fixes on /fix; 3-D", kitti_imu_gnss
     ),
     "sphere2500": Dataset(
         "simulated, on a sphere: 2,500 poses, 4,949 relative poses on /edges, truth on /truth; 3-D", pose_graphs.sphere2500

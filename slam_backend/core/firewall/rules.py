@@ -120,6 +120,10 @@ RULES: Mapping[str, Rule] = {
     "imu/saturated": Rule(
         "warn", "the IMU reached the end of its range; the stretch is not used", "damp the mounting, or set a larger range", unit="s"
     ),
+    "imu/interpolated": Rule(
+        "warn", "for longer than a gap the samples lie on a straight line: somebody filled a gap with them; the stretch is not used",
+        "send only what was measured: a gap is better than a guess", unit="s", setting="<imu>.max_gap",
+    ),
     "imu/gravity": Rule(
         "error", "at the start the mean acceleration is nothing like gravity",
         "accelerations must be in m/s^2 and include gravity (at rest 9.81 upwards)", unit="m/s^2", setting="<imu>.gravity",

@@ -149,7 +149,9 @@ def _of_motion(motion: Motion, arm: Array) -> Array:
 
 
 def _sights(offers: Sequence[Offer], context: Context, config: GnssSource) -> Array:
-    """(N, 7) of some of the fixes: antenna by odometry in the map, antenna by the fix, standard deviation; m."""
+    """(N, 9) of some of the fixes: antenna by odometry in the map, antenna by the fix, standard deviation, all in m; then x and y of
+    the direction that the base looks in.
+    """
     rows = []
     for offer in offers[:: -(-len(offers) // SEEN) or 1]:
         m = offer.measurement
@@ -164,8 +166,9 @@ def _sights(offers: Sequence[Offer], context: Context, config: GnssSource) -> Ar
         antenna = np.zeros(3)
         antenna[: context.space.point_dimension] = pose.transformFrom(mount.translation())
         sigma = sqrt(np.trace(stated(m, config)[:2, :2]) / 2)
-        rows.append((*antenna, *enu(m.place, context.origin), sigma))
-    return np.array(rows).reshape(-1, 7)
+        ahead = pose.rotation().matrix()[:2, 0]
+        rows.append((*antenna, *enu(m.place, context.origin), sigma, *ahead))
+    return np.array(rows).reshape(-1, 9)
 
 
 def _first_guess(sights: Array, context: Context) -> Pose | str:
@@ -174,27 +177,38 @@ def _first_guess(sights: Array, context: Context) -> Pose | str:
     if not len(sights):
         return "no fix has a place on the trajectory yet"
     antenna, fixes, sigma = sights[:, :3], sights[:, 3:6], float(np.median(sights[:, 6]))
+    points = _headed(fixes, sights[:, 7:]) if context.by_imu else antenna[:, :2]
     if settings.yaw is not None:
         yaw, weights = -settings.yaw, np.ones(len(sights))
     else:
-        reach = float(np.linalg.norm(antenna[:, :2] - antenna[0, :2], axis=1).max())
+        reach = float(np.linalg.norm(points - points[0], axis=1).max())
         needed = max(settings.baseline, sqrt(2) * sigma / settings.yaw_within)
         if reach < needed:
             return (
                 f"yaw not yet observable: the fixes reach over {reach:.1f} m, and {needed:.1f} m are needed"
             )
-        yaw, weights = _aligned(antenna[:, :2], fixes[:, :2], sigma)
+        yaw, weights = _aligned(points, fixes[:, :2], sigma)
     c, s = cos(yaw), sin(yaw)
     turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-    offsets = antenna - fixes @ turn.T
-    shift = np.average(offsets, axis=0, weights=weights)
-    away = float(np.median(np.linalg.norm((offsets - shift)[:, :2], axis=1)))
+    shift = np.average(antenna - fixes @ turn.T, axis=0, weights=weights)
+    beside = points - (fixes @ turn.T)[:, :2]
+    beside -= np.average(beside, axis=0, weights=weights)
+    away = float(np.median(np.linalg.norm(beside, axis=1)))
     if settings.yaw is None and away > MISFIT * sigma + SLIP * reach:
         return (
             f"yaw not yet observable: half of the fixes lie {away:.1f} m and more beside the odometry's path"
         )
     size = context.space.point_dimension
     return context.space.rigid(turn[:size, :size], shift[:size])
+
+
+def _headed(fixes: Array, ahead: Array) -> Array:
+    """(N, 2) a path from fix to fix, as far as they lie apart and where the base looks: an IMU knows directions, but not how fast
+    it was when it began.
+    """
+    lengths = np.linalg.norm(np.diff(fixes[:, :2], axis=0), axis=1)
+    steps = lengths[:, None] * (ahead[:-1] + ahead[1:]) / 2
+    return np.concatenate([np.zeros((1, 2)), np.cumsum(steps, axis=0)])
 
 
 def _aligned(points: Array, fixes: Array, sigma: float) -> tuple[float, Array]:

@@ -10,10 +10,11 @@ from slam_backend.core.backend import Backend
 from slam_backend.core.config import ImuSource, config_from
 from slam_backend.core.errors import BadConfig
 from slam_backend.core.geometry import matrix_of
-from slam_backend.core.graph import Decision
+from slam_backend.core.graph import EARTH, Decision
 from slam_backend.core.inertial import ImuSample, Inertial, State
 from slam_backend.core.measurement import SECOND, format_stamp, frozen
 from slam_backend.core.robust.chi2 import chi2_quantile
+from slam_backend.core.sensors.gnss import Fix, geodetic
 from slam_backend.core.sensors.imu import bias_key, velocity_key
 from slam_backend.core.sensors.odometry import STILL, UNKNOWN, OdometryPose
 from slam_backend.core.sensors.pose import AbsolutePose
@@ -181,6 +182,29 @@ def test_an_imu_elsewhere_on_the_robot_tells_how_the_base_moves():
     np.testing.assert_allclose(end.velocity, flight.velocities[-1], atol=0.01)
 
 
+def test_with_fixes_alone_the_yaw_on_the_earth_and_the_speed_are_found():
+    """Nothing tells how fast the robot is when it begins, nor where it looks: an IMU, and a fix each second."""
+    flight = Flight(4)
+    turn, origin = gtsam.Rot3.Yaw(2.0), (49.0, 8.0, 100.0)
+    fixes = [
+        Fix(each.stamp, "gps", "base", frozen(geodetic(turn.rotate(each.pose[:3]), origin)), frozen(np.eye(3) * 0.01))
+        for each in flight.fixes()
+    ]  # fmt: skip
+    gps = {"kind": "gnss", "keyframe": True}
+    settings = config_from({
+        "space": "3d", "base_frame": "base", "keyframes": {"distance": 100, "angle": 6}, "earth": {"origin": origin},
+        "sources": ["imu", "gps"], "imu": IMU, "gps": gps,
+    })  # fmt: skip
+    backend, _ = run(settings, flight.samples, fixes)
+    keyframe, pose, velocity, _ = last(backend)
+    map_T_earth = backend.estimate.pose(EARTH)
+    n = flight.stamps.index(keyframe.stamp)
+    found = map_T_earth.transformTo(pose.translation())
+    assert np.linalg.norm(found - turn.rotate(flight.poses[n][:3, 3])) < 0.4
+    speed = map_T_earth.rotation().unrotate(velocity)
+    assert np.linalg.norm(speed - turn.rotate(flight.velocities[n * RATE // 2])) < 0.2
+
+
 def test_odometry_drives_and_the_imu_finds_its_bias_and_the_tilt():
     """The odometry starts level, the robot does not: gravity says so."""
     flight = Flight(3)
@@ -212,6 +236,24 @@ def test_a_gap_and_a_saturated_sample_cost_their_stretch_and_nothing_else():
     assert len(refused) <= 4
     end = backend.snapshot().at([flight.stamps[-1]])[0]
     assert np.linalg.norm(end[:3] - flight.poses[-1][:3, 3]) < 0.5
+
+
+def test_samples_that_somebody_drew_across_a_gap_count_as_a_gap():
+    flight = Flight(1)
+    first, last = 5 * RATE, 7 * RATE
+    ends = flight.samples[first], flight.samples[last]
+    drawn = [
+        replace(each, **{
+            name: frozen(getattr(ends[0], name) + (getattr(ends[1], name) - getattr(ends[0], name)) * k / (last - first))
+            for name in ("rate", "acceleration")
+        })
+        for k, each in enumerate(flight.samples[first:last])
+    ]  # fmt: skip
+    samples = [*flight.samples[:first], *drawn, *flight.samples[last:]]
+    _, decisions = run(config("fixes"), samples, flight.fixes())
+    found = [each for each in decisions if each.reason == "interpolated"]
+    assert 2 <= len(found) <= 3
+    assert all(flight.stamps[0] + 5 * SECOND < each.stamp < flight.stamps[0] + 8 * SECOND for each in found)
 
 
 def test_while_the_imu_is_silent_odometry_goes_on_and_afterwards_it_begins_anew():
