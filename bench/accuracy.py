@@ -7,13 +7,12 @@ import sys
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
-import numpy as np
 import yaml
 
+from bench.fixes import away, away_by_lines, rms
+from bench.kitti import kitti
 from bench.table import Row, markdown
 from slam_backend.core.config import config_from
-from slam_backend.core.fixes import Compared
-from slam_backend.core.measurement import Array
 from slam_backend.io.replay import replay
 
 TITLE = "Accuracy on real data"
@@ -50,24 +49,9 @@ def husky() -> list[Row]:
     return made
 
 
-def away(found: Compared) -> Array:
-    """(N,) m horizontally from each fix to where its antenna is believed to have been."""
-    return np.asarray(np.linalg.norm((found.antennas - found.fixes)[:, :2], axis=1))
-
-
-def away_by_lines(found: Compared) -> Array:
-    """(N,) the same of straight lines between the fixes that are not kept back."""
-    used = ~found.withheld
-    drawn = [np.interp(found.stamps, found.stamps[used], found.fixes[used, axis]) for axis in (0, 1)]
-    return np.asarray(np.hypot(drawn[0] - found.fixes[:, 0], drawn[1] - found.fixes[:, 1]))
-
-
-def rms(errors: Array) -> float:
-    return float(np.sqrt(np.mean(errors**2)))
-
-
 SETS: Mapping[str, Callable[[], list[Row]]] = {
-    "husky": husky
+    "husky": husky,
+    "kitti": kitti,
 }  # name -> rows; none where the data are not at hand
 
 

@@ -120,18 +120,6 @@ def encode_imu(
     return message.finish()
 
 
-def encode_fix(stamp: int, frame: str, place: ArrayLike, covariance: ArrayLike) -> bytes:
-    """sensor_msgs/msg/NavSatFix. place: latitude and longitude in degrees, m above the ellipsoid; covariance (9,) east, north, up."""
-    message = _Bytes()
-    message.header(stamp, frame)
-    message.add(pack("<b", 0))  # a fix, of whatever
-    message.add(pack("<H", 1), 2)  # service: GPS
-    message.doubles(place, 3)
-    message.doubles(covariance, 9)
-    message.add(pack("<B", 3))  # the covariance is known
-    return message.finish()
-
-
 def encode_pose_with_covariance(stamp: int, frame: str, seven: ArrayLike, covariance: ArrayLike) -> bytes:
     """geometry_msgs/msg/PoseWithCovarianceStamped."""
     message = _Bytes()

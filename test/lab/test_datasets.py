@@ -12,9 +12,12 @@ import yaml
 from slam_backend.core.config import config_from
 from slam_backend.core.errors import BadConfig
 from slam_backend.core.geometry import covariance_from_ros, inverse_of, matrix_of
+from slam_backend.core.measurement import SECOND
 from slam_backend.core.sensors import landmark, odometry, relative
 from slam_backend.io.bags import open_bag
+from slam_backend.io.configfile import load_config
 from slam_backend.io.formats import tum
+from slam_backend.io.replay import replay
 from slam_backend.lab.datasets import DATASETS, beacons, make_dataset
 
 ROOT = Path(__file__).parents[2]
@@ -173,3 +176,19 @@ def test_plaza_has_the_numbers_of_the_files_beside_their_truth(
 def test_an_unknown_data_set_is_refused_with_the_known_ones(tmp_path) -> None:
     with pytest.raises(BadConfig, match=", ".join(DATASETS)):
         make_dataset("moon", tmp_path / "x.mcap")
+
+
+def test_kitti_has_an_imu_and_fixes_and_its_configuration_finds_yaw_and_speed(tmp_path: Path) -> None:
+    """The first minute: the car moves when it begins, and nobody says where it looks."""
+    made = make_dataset("kitti_imu_gnss", tmp_path / "kitti.mcap")
+    assert made.messages == 46_968 + 470
+    run = replay(made.path, load_config(ROOT / "config/kitti_imu_gnss.yaml"), ("gps.withhold=[[30, 472]]",))
+    for update in run:
+        if update.keyframe.stamp > 46_565 * SECOND:
+            break
+    backend = run.backend
+    found = backend.compared(backend.snapshot())
+    inside = (found.stamps > 46_550 * SECOND) & ~np.isnan(found.antennas[:, 0])
+    away = np.linalg.norm((found.antennas - found.fixes)[inside, :2], axis=1)
+    assert len(away) > 10
+    assert away.max() < 0.3
