@@ -5,6 +5,7 @@ cheap; left alone for a while, it lets go of the journal.
 """
 
 import multiprocessing
+import os
 import signal
 import threading
 from collections.abc import Callable, Mapping
@@ -26,6 +27,7 @@ from .replay import Run
 PATIENCE = 600.0  # s that a replay to the moment in question may take
 IDLE = 30.0  # s without a question after which the journal is let go
 LOOK = 0.2  # s between two looks at whether to stop
+NICE = 10  # of processes that answer somebody who waits anyway: node and worker come first
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,6 +108,7 @@ def serve(pipe: Connection, journal: Path, config: Config) -> None:
     """The process; ends when the node is gone, or by SIGTERM: it holds nothing that could be lost."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the node's affair
     signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT, signal.SIGTERM})
+    os.nice(NICE)
 
     def begin() -> Run:
         return Run(open_inputs([journal]), config, [], flush=False)

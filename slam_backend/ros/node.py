@@ -5,6 +5,7 @@ condition wakes the executor -> publishers. ~/odometry is made here, from the ne
 so that it never waits for the solver. No callback blocks, and none ends the node.
 """
 
+import gc
 import signal
 import sys
 import threading
@@ -400,6 +401,8 @@ def _run(node: BackendNode, wishes: Sequence[int]) -> int:
         if node.trigger_configure() != TransitionCallbackReturn.SUCCESS:
             return 2  # the reason has been logged
         node.trigger_activate()
+    gc.collect()
+    gc.freeze()  # modules and message types: to look through them again and again would stop all threads for 50 ms each time
     while not wishes and rclpy.ok():
         executor.spin_once()
     return 0
