@@ -241,8 +241,8 @@ class Journal:
                 name: type_ for name, type_ in self._announced.items() if name not in announced
             }
             for _ in batch:
-                _, record = self._queue.popleft()
-                self._bytes -= len(record.data)
+                self._queue.popleft()
+            self._bytes -= sum(len(record.data) for _, record in batch)
             self._full = False
         with self._grown:
             self.committed += len(batch)

@@ -7,6 +7,7 @@ word. Here a row counts only if it matches its checksum and follows the one befo
 import sqlite3
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
+from functools import lru_cache
 from typing import Any
 from zlib import crc32
 
@@ -18,7 +19,12 @@ UNREADABLE = (sqlite3.Error, UnicodeDecodeError)  # the latter when the schema i
 
 def checksum(topic: str, type_: str, log_time: int, data: bytes) -> int:
     """CRC-32 of a record."""
-    return crc32(data, crc32(f"{topic}\0{type_}\0{log_time}".encode()))
+    return crc32(data, crc32(b"%d" % log_time, _of_names(topic, type_)))
+
+
+@lru_cache(maxsize=1024)
+def _of_names(topic: str, type_: str) -> int:
+    return crc32(f"{topic}\0{type_}\0".encode())
 
 
 def is_sealed(database: sqlite3.Connection, source: Source) -> bool:

@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 
 _HEADER, _FRAME = Struct(">8I"), Struct(">6I")
 _MAGIC = {0x377F0682: "<u4", 0x377F0683: ">u4"}  # -> words that the checksums are made of
-_SALTS = slice(8, 16)  # of a frame's header; equal to those of the log's header at 16
 
 Words = NDArray[np.uint32]
 
@@ -55,7 +54,7 @@ def _whole(raw: bytes, page: int) -> int:
         _, commit, *_, sum0, sum1 = _FRAME.unpack_from(raw, at)
         content = raw[at : at + 8] + raw[at + _FRAME.size : at + step]
         sums = _sums(sums, np.frombuffer(content, _MAGIC[magic]))
-        if sums != (sum0, sum1) or raw[at:][_SALTS] != raw[16:24]:
+        if sums != (sum0, sum1) or raw[at + 8 : at + 16] != raw[16:24]:
             break
         if commit:
             whole = at + step
@@ -63,8 +62,8 @@ def _whole(raw: bytes, page: int) -> int:
 
 
 def _belongs(raw: bytes, at: int) -> bool:
-    """Whether a frame is of the log's newest round: those of earlier rounds have other salts. One of the two may be damaged."""
-    salts = raw[at:][_SALTS]
+    """Whether a frame is of the log's newest round, with the salts of its header: those of earlier rounds have other salts. One of the two may be damaged."""
+    salts = raw[at + 8 : at + 16]
     return len(salts) < 8 or salts[:4] == raw[16:20] or salts[4:] == raw[20:24]
 
 
