@@ -2,6 +2,7 @@
 
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from math import isnan
 from typing import Any, Literal, get_args
@@ -174,11 +175,12 @@ def _placed(
     for wait in waits:
         m = wait.offer.measurement
         assert isinstance(m, LandmarkObservation)
-        placed = context.place(m.stamp)  # its keyframe may have been taken back since
-        if placed is not None and context.component(placed.keyframe.pose) == part:
-            seen = _in_space(m, context.space, config)
-            sightings.append(sighting(m.form, seen, placed, _mount(m, context, config), context))
-            offers.append(wait.offer)
+        with suppress(Unusable):  # any more: a keyframe may have been taken back since
+            placed = context.landing(m.stamp)
+            if context.component(placed.keyframe.pose) == part:
+                seen = _in_space(m, context.space, config)
+                sightings.append(sighting(m.form, seen, placed, _mount(m, context, config), context))
+                offers.append(wait.offer)
     found = place(sightings)
     assert isinstance(newest.measurement, LandmarkObservation)
     decision = told(newest, newest.measurement.landmark, found, len(sightings))
