@@ -74,6 +74,14 @@ class Browser:
         assert "exceptionDetails" not in found, found["exceptionDetails"]
         return found["result"].get("value")
 
+    @property
+    def empty(self):
+        """Ids of figures of which nothing can be seen: no trace, or a drawing context that the browser took back."""
+        return self.run("""(() => {
+            const lost = canvas => { const gl = canvas.getContext("webgl2") || canvas.getContext("webgl"); return gl && gl.isContextLost(); };
+            return [...document.querySelectorAll(".figure")]
+                .filter(each => !(each.data || []).length || [...each.querySelectorAll("canvas")].some(lost)).map(each => each.id); })()""")
+
     def click(self, x, y):
         for kind in ("mouseMoved", "mousePressed", "mouseReleased"):
             self.call(

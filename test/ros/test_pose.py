@@ -101,3 +101,20 @@ def test_only_a_newer_stamp_goes_on() -> None:
 def test_an_answer_is_new_once() -> None:
     odometer, first, second = Odometer(QUIET), update(seven(), seven()), update(seven(), seven())
     assert [odometer.is_new(each) for each in (first, first, second, second)] == [True, False, True, False]
+
+
+def test_where_the_odometry_jumps_nothing_is_told_until_the_worker_knows_what_it_was() -> None:
+    """A restart: from then on in the new frame. A lone jump: the next message goes on from before."""
+    odometer, correction = Odometer(QUIET), seven(0.0, 7.0)
+
+    def x_of(n, x, told):
+        located = odometer.locate(odometry(n, x), told, spread(1, 1, 1))
+        return None if located is None else pytest.approx(located.seven[0])
+
+    before = update(seven(), correction)
+    assert [x_of(1, 1.0, before), x_of(2, 500.0, before), x_of(3, 501.0, before)] == [1.0, None, None]
+    after = Update(keyframe(4, START + 2 * SECOND), seven(2.0, 7.0), correction, 1, (), seven(-498.0))
+    assert [x_of(4, 502.0, after), x_of(5, 900.0, after), x_of(6, 504.0, after)] == [4.0, None, 6.0]
+    located = odometer.locate(odometry(7, 505.0), after, None)
+    assert located is not None
+    assert composed(located.correction, seven(505.0)) == pytest.approx(seven(7.0, 7.0))

@@ -29,8 +29,8 @@ class Measured:
         self.keys = np.array([factor.keys() for factor in factors], dtype=np.uint64).reshape(-1, ends)
         poses = [factor.measured() if ends == 2 else factor.prior() for factor in factors]
         self.poses = np.array([(pose.x(), pose.y(), pose.theta()) for pose in poses]).reshape(-1, 3)
-        information = np.array([factor.noiseModel().information() for factor in factors]).reshape(-1, 3, 3)
-        self._root = np.linalg.cholesky(information).swapaxes(1, 2)
+        # R^T R is the information, which is singular where only a place is measured.
+        self._root = np.array([factor.noiseModel().R() for factor in factors]).reshape(-1, 3, 3)
 
     def linearized(self, found: Array) -> tuple[Array, Array]:
         """(M, 3, 3) Jacobians at the child and (M, 3) right-hand sides, whitened, at (M, 3) poses as found."""

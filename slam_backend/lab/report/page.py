@@ -14,6 +14,9 @@ from numpy.typing import ArrayLike
 
 Figure = dict[str, Any]  # data and layout, as plotly.js takes them
 DTYPES = {"f": np.float32, "i": np.int32}
+ABOVE, BELOW = 34, 48  # pixels of a figure for its buttons, and for the axis below
+TITLED = 58  # of these for its numbers and title
+CROWD = 2_000  # dots
 AXIS = {"zeroline": False, "gridcolor": "#e4e7ec", "linecolor": "#c5cad3", "ticks": "outside"}
 
 
@@ -36,16 +39,23 @@ def numbers(values: ArrayLike) -> dict[str, str]:
     return {"dtype": packed.dtype.str[1:], "bdata": b64encode(packed.tobytes()).decode()}
 
 
+def drawer(count: int) -> str:
+    """What draws so many dots, or pieces of a line. WebGL only for a crowd: it costs a figure three of a page's sixteen contexts, and a
+    browser that runs out of them takes the first ones back, and leaves these figures empty.
+    """
+    return "scattergl" if count > CROWD else "scatter"
+
+
 def line(name: str, colour: str, x: ArrayLike, y: ArrayLike, **more: Any) -> dict[str, Any]:
     return {
-        "type": "scattergl", "mode": "lines", "name": name, "x": numbers(x), "y": numbers(y),
+        "type": "scatter", "mode": "lines", "name": name, "x": numbers(x), "y": numbers(y),
         "line": {"color": colour, "width": 1.6}, **more,
     }  # fmt: skip
 
 
 def dots(name: str, colour: str, x: ArrayLike, y: ArrayLike, **more: Any) -> dict[str, Any]:
     return {
-        "type": "scattergl", "mode": "markers", "name": name, "x": numbers(x), "y": numbers(y),
+        "type": drawer(len(np.asarray(x))), "mode": "markers", "name": name, "x": numbers(x), "y": numbers(y),
         "marker": {"color": colour, "size": 5}, **more,
     }  # fmt: skip
 
@@ -59,11 +69,11 @@ def figure(
         "data": list(data),
         "layout": {
             "height": height,
-            "margin": {"l": 60, "r": 16, "t": 16, "b": 48},
+            "margin": {"l": 60, "r": 16, "t": ABOVE, "b": BELOW},
             "paper_bgcolor": "white",
             "plot_bgcolor": "white",
             "hovermode": "closest",
-            "legend": {"orientation": "h", "y": -0.18},
+            "legend": {"orientation": "h", "yanchor": "top", "y": -TITLED / (height - ABOVE - BELOW)},
             "xaxis": {**AXIS, "title": {"text": x}},
             "yaxis": vertical,
             **layout,

@@ -7,7 +7,7 @@ import numpy as np
 from ...core.measurement import SECOND, Array
 from ...core.trajectory import Stamps, Trajectory
 from ..colours import LOOP, ODOMETRY, ONLINE, SMOOTHED
-from .page import Section, drawn, figure, line, numbers, script_data
+from .page import Section, drawer, drawn, figure, line, numbers, script_data
 from .subject import Subject
 from .verdicts import entered, loops_of
 
@@ -67,7 +67,7 @@ def section(run: Subject) -> Section | None:
         line("smoothed, as known then", SMOOTHED, [], []),
         line("newest pose while driving", ONLINE, [], [], opacity=0.7),
         {**line("newest pose", ONLINE, [], []), "mode": "markers", "marker": {"size": 12, "color": ONLINE}},
-        line("loops", LOOP, [], [], opacity=0.5),
+        line("loops", LOOP, [], [], type=drawer(max(loops, default=0)), opacity=0.5),
     ]
     drawing = figure(first, "x (m)", "y (m)", equal=True, height=560, uirevision="stay")
     for axis, k in (("xaxis", 0), ("yaxis", 1)):

@@ -28,7 +28,9 @@ def section(run: Subject) -> Section:
         "MB": f"{told['memory_mb']:.0f}",
     }
     shown = "".join(
-        f'<div class="card"><b>{value}</b><span>{name}</span></div>' for name, value in cards.items()
+        f'<div class="card"><b>{value}</b><span>{name}</span></div>'
+        for name, value in cards.items()
+        if value not in ("0", "0 of 0")
     )
     facts = [("run hash", told["run_hash"]), ("config hash", told["config_hash"])]
     facts += [(f"version of {name}", value) for name, value in told["versions"].items()]

@@ -38,4 +38,5 @@ def section(run: Subject) -> Section:
         height=320,
         yaxis2={"title": {"text": "memory (MB)"}, "overlaying": "y", "side": "right", "rangemode": "tozero"},
     )
+    sizes["layout"]["margin"]["r"] = 64  # the axis on the right
     return Section("Timing", body + drawn("times") + drawn("sizes"), {"times": times, "sizes": sizes})

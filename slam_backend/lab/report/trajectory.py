@@ -10,7 +10,7 @@ import numpy as np
 from ...core.measurement import Array
 from ...core.trajectory import Trajectory
 from ..colours import LANDMARK, ODOMETRY, ONLINE, OTHERS, SMOOTHED, TRUTH, VERDICTS
-from .page import Figure, Section, dots, drawn, figure, line, numbers, script_data
+from .page import Figure, Section, dots, drawer, drawn, figure, line, numbers, script_data
 from .subject import Subject
 from .verdicts import loops_of, sentence
 
@@ -82,7 +82,7 @@ def _thinned(trajectory: Trajectory) -> Array:
 def _segments(verdict: str, members: Sequence[int], ends: Array, flat: bool) -> list[dict[str, Any]]:
     """One line of gaps, and a mark in the middle of each loop that can be clicked."""
     broken = np.concatenate([ends, np.full((len(ends), 1, 3), np.nan)], axis=1).reshape(-1, 3)
-    colour, name = VERDICTS[verdict], f"{len(members)} loops {verdict}"
+    colour, name = VERDICTS[verdict], f"{len(members)} loops {'on ' * (verdict == 'probation')}{verdict}"
     middle = ends.mean(axis=1)
     if not flat:
         marker = {"color": colour, "size": 3}
@@ -91,7 +91,9 @@ def _segments(verdict: str, members: Sequence[int], ends: Array, flat: bool) -> 
             _cloud(name, middle, "markers", marker=marker, customdata=members, showlegend=False),
         ]
     return [
-        line(name, colour, *broken[:, :2].T, opacity=0.5, legendgroup=verdict, hoverinfo="skip"),
+        line(
+            name, colour, *broken[:, :2].T, type=drawer(len(ends)), opacity=0.3, legendgroup=verdict, hoverinfo="skip"
+        ),
         dots(
             name, colour, *middle[:, :2].T, customdata=members, legendgroup=verdict, showlegend=False,
             hovertemplate="click: why<extra></extra>",

@@ -223,6 +223,24 @@ def test_the_planar_logarithm_and_its_derivative_are_those_of_gtsam():
         assert gtsam.Pose2(*seen).equals(gtsam.Pose2(*i).between(gtsam.Pose2(*j)), 1e-12)
 
 
+def test_planar_factors_that_measure_a_place_alone_are_polished_too():
+    """Their information is singular: as fixes on poses whose heading the edges tell."""
+    space, values, root = SPACES["2d"], gtsam.Values(), np.diag((10.0, 10.0, 0.0))
+    place = gtsam.noiseModel.Gaussian.SqrtInformation(root, False)
+    factors = [edge(space, n, n + 1, gtsam.Pose2(1.0, 0.0, 0.3)) for n in range(6)]
+    for n in range(7):
+        values.insert(X(n), gtsam.Pose2(n, 0.1 * n, 0.2))
+        prior = space.prior(X(n), gtsam.Pose2(n, n * n / 10, 2.0), place)
+        factors.append(Factor(f"fixes/{n}", "gnss", prior, (X(n),), n))
+    graph = gtsam.NonlinearFactorGraph()
+    for each in factors:
+        graph.add(each.factor)
+    native = gtsam.LevenbergMarquardtOptimizer(graph, values).optimize()
+    found = polish(factors, native)
+    assert found.cost == pytest.approx(graph.error(native), rel=1e-5)
+    assert found.cost <= graph.error(native)
+
+
 @pytest.mark.parametrize("angle", [0.0, 1e-12, 1e-9, 1e-6, 1.9e-3, 2.1e-3])
 def test_the_planar_logarithm_loses_nothing_near_zero(angle):
     """Against the series to the fourth power, which is exact there."""
