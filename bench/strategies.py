@@ -83,7 +83,7 @@ def played(case: Case, settings: dict[str, Any]) -> Played:
     backend = Backend(config_from({"space": case.graph.space, **sources, **settings}))
     run = Played(backend, Tally(case.label), 0.0, [])
     watch: list[float] = []
-    backend._robust = [Timed(stage, watch) for stage in backend._robust]  # noqa: SLF001  # the watch is no part of the product
+    backend.jury.stages = [Timed(stage, watch) for stage in backend.jury.stages]
     seconds = 0.0
     for each in [*measurements(case.graph), None]:
         watch.clear()

@@ -10,7 +10,7 @@ import numpy as np
 from gtsam import symbolIndex
 
 from .adopted import Adopted
-from .apply import Applier, touched, without
+from .apply import Applier, without
 from .association import Associator
 from .beside import Beside
 from .command import Command
@@ -39,6 +39,7 @@ from .graph import (
 )
 from .growth import Growth
 from .inertial import ImuSample, Inertial, State, Stretch, imu_of, pace_from
+from .jury import Jury
 from .keyframes import Timeline, Track, due
 from .measurement import SECOND, Array, Measurement, StaticTransform
 from .mounts import Mounts
@@ -104,7 +105,6 @@ class Backend:
         self.space = space = SPACES[config.space]
         self.solver = solver or SOLVERS["isam2"](config, space)
         self._paths = paths = Paths(space, config.gate.odometry_scale, self.solver.factors)
-        self._robust = _stages(config, paths) if robust is None else robust
         self._driver = config.driver
         if self._driver is None:
             raise BadConfig("no source drives the keyframes: add one of kind odometry, imu or relative")
@@ -137,13 +137,14 @@ class Backend:
         self._is_complete = False  # nothing was offered since the last keyframes along edges were made
         self._growth = Growth(space, self.timeline, self.track, self.parts)
         self._decisions: list[Decision] = []  # told with the next update
-        self._undecided: dict[str, Decision] = {}  # what a stage thinks over: what those before it found
         self._newest: tuple[Keyframe, Pose] | None = None  # and its odometry pose
-        book = paths.book if self._robust else lambda _: None
+        stages = _stages(config, paths) if robust is None else robust
+        book = paths.book if stages else lambda _: None
         self._applier = Applier(self.solver, space, self.parts, self._waiting.wake, book)
         self._editor = Editor(
             self.solver, space, self._applier, lambda key: self.timeline.keyframes[symbolIndex(key)].stamp
         )
+        self.jury = Jury(stages, self._applier, self._editor)
         self._revision = 0
 
     def load(self, saved: SavedMap) -> None:
@@ -212,9 +213,9 @@ class Backend:
         self._decisions += self._waiting.leftovers()
         if self._newest and (edges := self._edges_beside()):
             updates += self._update(self._newest[0], Delta(edges), [], [])
-        if self._newest and self._robust:
+        if self._newest and self.jury:
             self._paths.ended = True
-            self._judge(Delta())
+            self._hear(Delta())
         if self._newest and self._decisions:
             updates.append(self._told(self._newest[0]))
         return updates
@@ -545,13 +546,13 @@ class Backend:
         self._decisions += delta.decisions
         self._decisions += [told for each in delta.waits for told in self._waiting.wait(each)]
         window = [*window, *self._waiting.landed(delta.values, {factor.id for factor in delta.add})]
-        judged = tuple(f for f in delta.add if any(f.kind in stage.kinds for stage in self._robust))
+        judged = tuple(factor for factor in delta.add if self.jury.judges(factor.kind))
         sure = without(delta, {factor.id for factor in judged})
         try:
             self._applier.apply(sure)
-            if self._robust:
+            if self.jury:
                 late = {key: guess for key, guess in delta.values.items() if key not in sure.values}
-                self._judge(Delta(judged, values=late))
+                self._hear(Delta(judged, values=late))
             self._reunite()
         except SolverFailure:
             self._give_up(delta, new, window)
@@ -582,50 +583,13 @@ class Backend:
         self._decisions += [decision for delta in deltas for decision in delta.decisions]
         return tuple(factor for delta in deltas for factor in delta.add)
 
-    def _judge(self, proposed: Delta) -> None:
-        self._editor.offered(proposed.add)
-        self._admit(proposed, self._robust)
-        for stage in self._robust:
-            amendment, decisions = stage.review(self.estimate)
-            added = {factor.id for factor in amendment.add}
-            decisions = tuple(self._with_basis(each) for each in decisions)
-            self._decisions += [each for each in decisions if each.id not in added]
-            others = [other for other in self._robust if other is not stage]
-            self._admit(amendment, others, {each.id: each for each in decisions if each.id in added})
-
-    def _with_basis(self, decision: Decision) -> Decision:
-        """With what earlier stages found, where a stage has taken its time to decide."""
-        before = self._undecided.pop(decision.id, None)
-        return replace(decision, basis={**before.basis, **decision.basis}) if before else decision
-
-    def _admit(
-        self, proposed: Delta, stages: Sequence[Robust], reviewed: Mapping[str, Decision] | None = None
-    ) -> None:
-        """Through the stages, then into the graph. reviewed: by id, why a review lets a factor in; that is what is told."""
-        passed = dict(reviewed or {})
-        for stage in stages:
-            if not proposed.add:
-                break
-            mine = tuple(factor for factor in proposed.add if factor.kind in stage.kinds)
-            others = tuple(factor for factor in proposed.add if factor.kind not in stage.kinds)
-            admitted, decisions = stage.admit(replace(proposed, add=mine), self.estimate)
-            proposed = replace(admitted, add=(*admitted.add, *others))
-            kept = {factor.id for factor in proposed.add}
-            for each in decisions:
-                before = passed.get(each.id, each)
-                last = before if reviewed and each.id in kept else each
-                told = replace(last, basis={**before.basis, **each.basis})
-                if each.id in kept:
-                    passed[each.id] = told
-                else:
-                    self._decisions.append(told)
-            decided = {each.id for each in decisions}
-            self._undecided |= {id_: each for id_, each in passed.items() if id_ not in decided | kept}
+    def _hear(self, proposed: Delta) -> None:
+        """The robust stages judge. What was decided before goes first: a person's wishes rest on all of it."""
         self._editor.note(self._decisions)
-        proposed, overruled = self._editor.respected(proposed, passed)
-        self._decisions += overruled
-        self._applier.apply(touched(proposed), passed)
-        self._decisions += self._applier.take_decisions()  # in the order in which they were made
+        try:
+            self.jury.hear(proposed)
+        finally:
+            self._decisions += self.jury.take_decisions()
 
     def _give_up(self, delta: Delta, new: Sequence[Keyframe], window: Sequence[Offer]) -> None:
         """Not even the motion could be solved: the keyframes are taken back. The next one spans the gap, and takes what

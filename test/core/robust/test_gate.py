@@ -73,7 +73,7 @@ def test_wrong_loops_stay_out_and_say_what_would_let_them_pass(drive):
 
 def explained(backend, decisions):
     """Each refusal of the gate has everything; what it says would let the loop pass does, in the very comparison of the gate."""
-    ruler, paths = backend._robust[0]._ruler, backend._paths
+    ruler, paths = backend.jury.stages[0]._ruler, backend._paths
     loops = {factor.id: factor for factor in backend.left_out}
     refused = [d for d in {d.id: d for d in decisions if d.ends}.values() if d.verdict == "refused"]
     for decision in refused:

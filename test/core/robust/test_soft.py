@@ -129,7 +129,7 @@ def test_wrong_loops_enter_and_are_told_to_weigh_little(dimension, stage):
     assert {verdicts[pair] for pair in ends(wrong)} == {"probation"}
     assert {verdicts[pair] for pair in ends(true)} <= {"accepted", "restored"}
     assert all(ended.last[pair].statistic < 0.5 for pair in ends(wrong))
-    weight = ended.backend._robust[0]._weight  # the same function, at the same estimate
+    weight = ended.backend.jury.stages[0]._weight  # the same function, at the same estimate
     for basis in (ended.last[pair].basis for pair in ends(wrong)):
         larger = basis["would_pass"]["loop"]
         assert weight(basis["distance"] / larger**2 * (1 - 1e-9)) >= 0.5
