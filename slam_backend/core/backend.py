@@ -44,6 +44,7 @@ from .keyframes import Timeline, Track, due
 from .measurement import SECOND, Array, Measurement, StaticTransform
 from .mounts import Mounts
 from .parts import Parts
+from .quarantine import Quarantine
 from .reunion import Reunion, reunion
 from .robust import ROBUST, Doubt, Robust
 from .robust.paths import Paths
@@ -105,6 +106,7 @@ class Backend:
         self.space = space = SPACES[config.space]
         self.solver = solver or SOLVERS["isam2"](config, space)
         self._paths = paths = Paths(space, config.gate.odometry_scale, self.solver.factors)
+        self._quarantine = Quarantine(config, space, self.solver.factors)
         self._driver = config.driver
         if self._driver is None:
             raise BadConfig("no source drives the keyframes: add one of kind odometry, imu or relative")
@@ -138,9 +140,9 @@ class Backend:
         self._growth = Growth(space, self.timeline, self.track, self.parts)
         self._decisions: list[Decision] = []  # told with the next update
         self._newest: tuple[Keyframe, Pose] | None = None  # and its odometry pose
-        stages = _stages(config, paths) if robust is None else robust
-        book = paths.book if stages else lambda _: None
-        self._applier = Applier(self.solver, space, self.parts, self._waiting.wake, book)
+        stages = _stages(config, paths, self._quarantine) if robust is None else robust
+        self._is_judged = bool(stages)
+        self._applier = Applier(self.solver, space, self.parts, self._waiting.wake, self._book)
         self._editor = Editor(
             self.solver, space, self._applier, lambda key: self.timeline.keyframes[symbolIndex(key)].stamp
         )
@@ -468,7 +470,8 @@ class Backend:
                 context, offers = self._context(guesses), by_source[name]
                 if associator := self._associators.get(name):
                     offers, decisions = associator.named(offers, a, b, context)
-                    self._decisions += decisions
+                    offers, refused = self._quarantine.let_in(offers, self._landmarks)
+                    self._decisions += decisions + refused
                 deltas.append(SENSORS[source.kind].factors(offers, a, b, context, source))
                 guesses = {**guesses, **deltas[-1].values}  # what one has found is there for the next
         return total(deltas)
@@ -558,6 +561,15 @@ class Backend:
             self._give_up(delta, new, window)
         return [self._told(b, delta.values.get(b.pose))] if self.timeline.at(b.stamp) is b else []
 
+    def _book(self, delta: Delta) -> None:
+        """What the solver has taken, for those who keep books on it."""
+        if self._is_judged:
+            self._paths.book(delta)
+            self._quarantine.book(delta)
+        if delta.remove:
+            for key in self._quarantine.left(self.estimate.knows):
+                self.parts.drop(key)
+
     def _reunite(self) -> None:
         """Join parts that have come to know enough of the same landmarks."""
         while waits := self._waiting.for_a_joint():
@@ -621,10 +633,12 @@ class Backend:
         return Update(b, *sevens, self._revision, decisions, self._origin)
 
 
-def _stages(config: Config, paths: Paths) -> list[Robust]:
-    """What judges proposed factors: loops as the configuration says, fixes on the earth always."""
+def _stages(config: Config, paths: Paths, quarantine: Quarantine) -> list[Robust]:
+    """What judges factors: loops as the configuration says, fixes on the earth and landmarks always."""
+    landmarks = any(isinstance(source, LandmarkSource) for source in config.sources.values())
     fixes = any(isinstance(source, GnssSource) for source in config.sources.values())
     return [
         *(ROBUST[name](config, paths) for name in config.robust),
         *([Doubt(config, paths)] if fixes else []),
+        *([quarantine] if landmarks else []),
     ]

@@ -221,6 +221,23 @@ class Floor(Section):
     )
 
 
+class Quarantine(Section):
+    """Landmarks that moved, move, or exist twice are taken out, by the history of their residuals."""
+
+    sightings: int = Field(
+        5,
+        ge=2,
+        le=30,
+        description="of the last 30 that do not fit, where other landmarks do, before a landmark is suspected",
+    )
+    probability: float = Field(
+        0.999,
+        gt=0,
+        lt=1,
+        description="with which a sighting fits, if noise is as stated (or as usual, if that is more)",
+    )
+
+
 class PathOutput(Section):
     """The node's ~/path: for eyes; complete trajectories go on ~/trajectory."""
 
@@ -552,6 +569,7 @@ class Config(Section):
     )
     journal: Journaling = Journaling()
     floor: Floor = Floor()
+    quarantine: Quarantine = Quarantine()
     path: PathOutput = PathOutput()
     earth: Earth = Earth()
     extrinsics: Mapping[str, tuple[float, float, float, float, float, float]] = Field(
