@@ -148,7 +148,11 @@ def _without(finished: "FinishedRun", edited: "Run") -> "Run":
     wishes, earlier = edited.backend.wishes, edited.edits.dropped
     found = finished.numbers(wishes.out, earlier)
     if lost := sorted(wishes.out.keys() - found.keys()):
-        raise SlamError(f"'{lost[0]}' is no single message of a source: there can be no replay without it")
+        continued = finished.summary.get("continued")
+        where = f", unless it is of the map that is continued: then edit {continued}" if continued else ""
+        raise SlamError(
+            f"'{lost[0]}' is no single message of a source: there can be no replay without it{where}"
+        )
     arguments = {
         "enable": sorted(without(id_, found) for id_ in wishes.forced),
         "reweight": {without(id_, found): k for id_, k in sorted(wishes.weights.items()) if id_ not in found},

@@ -13,6 +13,10 @@ from .firewall.rules import MOST_WAITING, decided
 from .graph import UNTIL_JOINED, Decision, Offer, Wait, identify
 from .measurement import Measurement, parse_stamp
 
+REMEMBERED = (
+    1 << 20
+)  # stamps of each source at which a measurement with the same stamp is still counted on; 12 MB
+
 
 class Waiting:
     """All that has been offered and is not in the graph yet."""
@@ -141,13 +145,23 @@ class Waiting:
 
 
 class _Tally:
-    """How many measurements of a source had the same stamp: in columns, since it grows with their number."""
+    """How many measurements of a source had the same stamp: in columns, since it grows with their number; of the newest stamps.
+
+    One that is older than all that is remembered gets a number that no other has.
+    """
 
     def __init__(self) -> None:
         self._stamps, self._newest = array("q"), array("i")
+        self._forgotten, self._strays = (
+            -1,
+            REMEMBERED,
+        )  # the newest stamp that is; numbers given to older ones
 
     def count(self, stamp: int) -> int:
         """The number of another measurement with this stamp, from 0 on."""
+        if stamp <= self._forgotten:
+            self._strays += 1
+            return self._strays
         at = self._place(stamp)
         self._newest[at] += 1
         return self._newest[at]
@@ -162,6 +176,10 @@ class _Tally:
             at = bisect_left(self._stamps, stamp)
             if self._stamps[at] == stamp:
                 return at
+        if len(self._stamps) >= REMEMBERED:
+            half = len(self._stamps) // 2
+            self._forgotten, at = self._stamps[half - 1], max(at - half, 0)
+            del self._stamps[:half], self._newest[:half]
         self._stamps.insert(at, stamp)
         self._newest.insert(at, -1)
         return at

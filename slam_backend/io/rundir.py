@@ -385,6 +385,11 @@ class FinishedRun:
         self._alike(again, Trajectory(self.online.stamps[: len(again)], self.online.sevens[: len(again)]))
 
     def _alike(self, again: Trajectory, first: Trajectory) -> None:
+        if len(again) > len(first) and set(first.stamps[:-1].tolist()) < set(again.stamps.tolist()):
+            raise BadFile(
+                f"{self.path}: its inputs go on after its end: it was saved while they came. Edit the running node (~/edit), "
+                "or the run that is saved at the end of the session"
+            )
         same = again.stamps.tolist() == first.stamps.tolist()
         if not same or np.abs(again.sevens - first.sevens).max(initial=0.0) > ALIKE:
             names = ", ".join(self.summary["input"])

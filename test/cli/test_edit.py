@@ -188,6 +188,19 @@ def test_an_input_that_is_gone_or_another_one_is_said(run, capsys, tmp_path):
         assert why in error
 
 
+def test_a_run_that_was_saved_while_its_inputs_came_says_so(drive, run, capsys, tmp_path):
+    with open_bag(drive[1].bag) as opened:
+        records = list(opened.records())
+    write_bag(tmp_path / "early.mcap", records[: 9 * len(records) // 10])
+    assert cli.main(["replay", str(tmp_path / "early.mcap"), "--config", str(drive[1].config), "--no-report",
+                     "--out", str(tmp_path / "early")]) == 0  # fmt: skip
+    path = tmp_path / "early" / "summary.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"input": [str(drive[1].bag)]}))
+    code, _, error = edit(capsys, tmp_path / "early", "--disable", "loops")
+    assert (code, error.count("\n")) == (2, 1)
+    assert "its inputs go on after its end" in error
+
+
 def test_an_edit_of_a_pose_graph_takes_its_edges(capsys, tmp_path):
     """A square whose closing edge is wrong: without it, the shape of the others."""
     lines = [f"VERTEX_SE2 {n} 0 0 0\n" for n in range(4)]

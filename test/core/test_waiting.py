@@ -71,3 +71,14 @@ def test_what_waited_for_a_variable_is_offered_again_when_it_is_there(waiting) -
     assert not waiting
     waiting.wake(3)
     assert waiting.window(5) == [offer]
+
+
+def test_numbers_are_remembered_of_the_newest_stamps_and_are_never_given_twice(waiting, monkeypatch) -> None:
+    monkeypatch.setattr(module, "REMEMBERED", 100)
+    rng = np.random.default_rng(2)
+    ids = []
+    for newest in range(1, 3000):
+        late = newest - int(rng.integers(0, 5)) * int(rng.integers(0, 200))
+        ids += [offered(waiting, "tags", max(stamp, 1)).id for stamp in (newest, late)]
+    assert len(set(ids)) == len(ids)
+    assert len(waiting._tallies["tags"]._stamps) <= 101

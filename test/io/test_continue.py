@@ -181,6 +181,36 @@ def test_earlier_beliefs_reach_back_into_the_map_that_was_continued(drive, went_
     assert FinishedRun(out).between(stamps[n + 5], stamps[n + 40]).keyframes == (n + 6, n + 41)
 
 
+def test_a_continued_run_is_edited_as_a_whole(drive, went_on, tmp_path, capsys):
+    """A loop of either session; decided anew can be only what was said in the later one."""
+    out = tmp_path / "on"
+    shutil.copytree(went_on[1], out)
+    loops = [factor.id for factor in went_on[0].factors if factor.kind == "loop"]
+    old, new = loops[0], loops[-1]
+    assert old in {factor.id for factor in drive.before.factors}
+    counts = FinishedRun(out).summary["counts"]
+
+    def edit(*arguments):
+        capsys.readouterr()
+        code = cli.main(["edit", str(out), *arguments])
+        return code, capsys.readouterr().err
+
+    assert edit("--disable", old, "--disable", new) == (0, "")
+    edited = FinishedRun(out)
+    assert edited.summary["counts"]["factors"] == counts["factors"] - 2
+    assert len(edited.trajectory) == counts["keyframes"]
+    assert edited.summary["sessions"] == went_on[0].summary["sessions"]
+    code, error = edit("--remove", new, "--replay")
+    assert (code, error.count("\n")) == (2, 1)
+    assert f"then edit {drive.run}" in error
+    assert edit("--undo") == (0, "")
+    assert FinishedRun(out).summary["counts"]["factors"] == counts["factors"]
+    assert edit("--remove", new, "--replay") == (0, "")
+    assert FinishedRun(out).summary["counts"]["loops_offered"] == counts["loops_offered"] - 1
+    third = replay(drive.second, continued=drive.run).result.summary["run_hash"]
+    assert third == went_on[0].summary["run_hash"], "the run that is continued is not touched"
+
+
 def test_what_is_not_later_than_the_map_is_refused(drive, tmp_path):
     with pytest.raises(BadFile, match=r"not one usable message .*session/overlap.*which ends at 17000000"):
         replay(drive.first, continued=drive.run).result  # noqa: B018
