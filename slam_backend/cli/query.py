@@ -18,7 +18,7 @@ def command(
         list[str],
         typer.Argument(
             metavar="NAME...",
-            help="pose@<t>, pose@<t>#cov, between@<a>,<b>, landmark/<id>, decision/<factor>; "
+            help="pose@<t>, pose@<t>#cov, between@<a>,<b>, velocity@<t>, bias@<t>, landmark/<id>, decision/<factor>; "
             "<t>, <a>, <b>: <sec>.<nsec>, now (the last keyframe) or k<keyframe index>. "
             "map@<t>/ before any of them: as believed at t.",
         ),

@@ -57,7 +57,7 @@ from .sessions import SavedMap, Tracks, fits, joined
 from .settle import FAR
 from .solvers import SOLVERS, Solver
 from .space import SPACES
-from .trajectory import Snapshot, Trajectory
+from .trajectory import Snapshot, States, Trajectory
 from .variables import moved
 from .waiting import Waiting, refusal
 
@@ -278,7 +278,17 @@ class Backend:
             names,
             points,
             self._revision,
+            self._states(values, keyframes) if self._imu else States(),
         )
+
+    def _states(self, values: gtsam.Values, keyframes: Sequence[Keyframe]) -> States:
+        """keyframes: in order of stamp."""
+        found = [k for k in keyframes if values.exists(velocity_key(k)) and values.exists(bias_key(k))]
+        numbers = [
+            (*values.atVector(velocity_key(k)), *values.atConstantBias(bias_key(k)).vector()) for k in found
+        ]
+        stamps = np.array([k.stamp for k in found], dtype=np.int64)
+        return States(stamps, np.array(numbers, dtype=np.float64).reshape(-1, 9))
 
     def earth(self) -> Array | None:
         """(7,) `map_T_earth`: where the frame east, north, up at `origin` lies in the map; None before that is known."""

@@ -3,6 +3,8 @@
     pose@<t>            map_T_base: x y z qx qy qz qw
     pose@<t>#cov        its covariance, 6x6 in ROS order: x y z, then rotations about the axes of the map
     between@<a>,<b>     a_T_b: x y z qx qy qz qw
+    velocity@<t>        x y z in the map, m/s: of a run with an IMU, linearly between keyframes
+    bias@<t>            of the IMU, in its frame: accelerometer x y z (m/s^2), gyroscope x y z (rad/s)
     landmark/<id>       x y z in the map
     decision/<factor>   the last decision about it
     map@<t>/<name>      any of these, as believed when everything up to t had been applied, and nothing later
@@ -23,10 +25,10 @@ from .graph import Motion
 from .keyframes import Track
 from .measurement import Array, format_stamp, parse_stamp
 from .space import Space
-from .trajectory import Stamps, Trajectory, shaped
+from .trajectory import Stamps, States, Trajectory, shaped
 
 FORMS = (
-    "pose@<t>", "pose@<t>#cov", "between@<a>,<b>", "landmark/<id>", "decision/<factor>", "map@<t>/<any of these>",
+    "pose@<t>", "pose@<t>#cov", "between@<a>,<b>", "velocity@<t>", "bias@<t>", "landmark/<id>", "decision/<factor>", "map@<t>/<any of these>",
 )  # fmt: skip
 PAST = "map@"  # what a name begins with that asks for an earlier belief
 MOMENTS = "<sec>.<nsec>, now or k<keyframe index>"
@@ -57,6 +59,9 @@ class Known(Protocol):
     @property
     def landmarks(self) -> Mapping[str, Array]: ...
 
+    @property
+    def states(self) -> States: ...
+
     def covariance(self, index: int) -> Array:
         """Of a keyframe's pose, at its tangent. SolverFailure if it is not determined."""
         ...
@@ -70,7 +75,7 @@ class Known(Protocol):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Answer:
-    """value: (7,), (6, 6) or (3,) numbers, or the fields of a decision; None: unknown, and `why`."""
+    """value: (7,), (6, 6), (3,) or (6,) numbers, or the fields of a decision; None: unknown, and `why`."""
 
     name: str
     value: Array | Mapping[str, Any] | None
@@ -87,7 +92,7 @@ class Moment:
 
 class Question(NamedTuple):
     name: str
-    kind: str  # pose, cov, between, landmark or decision
+    kind: str  # pose, cov, between, velocity, bias, landmark or decision
     moments: tuple[Moment, ...] = ()
     identifier: str = ""
     past: Moment | None = None  # when it was believed; None: the newest belief
@@ -115,6 +120,8 @@ def _question(name: str, asked: str) -> Question:
     moments = when.split(",")
     if at and kind == "pose" and len(moments) == 1 and what == ("cov" if hash_ else ""):
         return Question(name, what or kind, (moment_of(name, when),))
+    if at and kind in ("velocity", "bias") and len(moments) == 1 and not hash_:
+        return Question(name, kind, (moment_of(name, when),))
     if at and kind == "between" and len(moments) == 2 and not hash_:
         return Question(name, kind, tuple(moment_of(name, text) for text in moments))
     raise BadConfig(f"'{name}' is none of {', '.join(FORMS)}")
@@ -230,6 +237,12 @@ def _value(asked: Question, known: Known, poses: Sequence[Posed]) -> Array | Map
         return poses[0][1]
     if asked.kind == "cov":
         return covariance_at(known, *poses[0])
+    if asked.kind in ("velocity", "bias"):
+        if (found := known.states.at(poses[0][0], known.trajectory.stamps)) is None:
+            raise Unknown(
+                f"no velocity and no bias is estimated at {format_stamp(poses[0][0])}: no IMU reaches it"
+            )
+        return found[:3] if asked.kind == "velocity" else found[3:]
     if asked.kind == "between":
         a, b = (matrix_of(seven) for _, seven in poses)
         return seven_of_matrix(inverse_of(a) @ b)

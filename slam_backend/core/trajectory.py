@@ -187,11 +187,33 @@ def _dot(a: Array, b: Array) -> Array:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class States:
+    """Of the keyframes that an IMU reaches. stamps: (M,) ns, increasing. numbers: (M, 9) velocity in the map (m/s), bias of the
+    accelerometer (m/s^2) and of the gyroscope (rad/s) in the IMU's frame.
+    """
+
+    stamps: Stamps = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+    numbers: Array = field(default_factory=lambda: np.zeros((0, 9)))
+
+    def at(self, stamp: int, keyframes: Stamps) -> Array | None:
+        """(9,) at a stamp between `keyframes` (N,), linearly from one to the next; None where one of the two has none."""
+        right = int(np.searchsorted(keyframes, stamp))
+        beside = (
+            keyframes[right : right + 1] if keyframes[right] == stamp else keyframes[right - 1 : right + 1]
+        )
+        rows = np.searchsorted(self.stamps, beside)
+        if (rows >= len(self.stamps)).any() or (self.stamps[rows] != beside).any():
+            return None
+        share = (stamp - beside[0]) / (beside[-1] - beside[0]) if len(beside) > 1 else 0.0
+        return np.asarray((1 - share) * self.numbers[rows[0]] + share * self.numbers[rows[-1]])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class Snapshot:
     """The estimate at one moment, a copy that never changes.
 
     trajectory: every keyframe in order of stamp. indices: (N,) their indices. odometry: what odometry alone says, from
-    the same start, at every sample that is kept. landmarks: (L, 3) in map, with `names`; revision: see Backend.
+    the same start, at every sample that is kept. landmarks: (L, 3) in map, with `names`; revision: see Backend. states: by an IMU.
     """
 
     trajectory: Trajectory
@@ -200,6 +222,7 @@ class Snapshot:
     names: tuple[str, ...]
     landmarks: Array
     revision: int
+    states: States = field(default_factory=States)
 
     @property
     def stamps(self) -> Stamps:

@@ -19,7 +19,7 @@ from ..core.graph import Decision, keyframe
 from ..core.measurement import Array, format_stamp
 from ..core.query import Unknown
 from ..core.space import Space
-from ..core.trajectory import Snapshot, Stamps, Trajectory
+from ..core.trajectory import Snapshot, Stamps, States, Trajectory
 from .replay import Run
 
 
@@ -83,6 +83,10 @@ class Then:
     @property
     def odometry(self) -> Trajectory:
         return self.snapshot.odometry
+
+    @property
+    def states(self) -> States:
+        return self.snapshot.states
 
     @property
     def landmarks(self) -> Mapping[str, Array]:

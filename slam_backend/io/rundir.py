@@ -20,7 +20,7 @@ from ..core.graph import Decision
 from ..core.measurement import Array, format_stamp, parse_stamp
 from ..core.query import Unknown
 from ..core.space import SPACES, Space
-from ..core.trajectory import Stamps, Trajectory
+from ..core.trajectory import Stamps, States, Trajectory
 from .configfile import load_config, write_yaml
 from .earth import NAME as FIXES
 from .earth import write_fixes
@@ -38,6 +38,8 @@ from .mapfile import NAME as MAP
 from .mapfile import write_map
 from .past import Past, Then
 from .replay import Final, Result, Run, replay, settled_stream
+from .states import NAME as STATES
+from .states import read_states, write_states
 
 AGAIN = "replay again"  # what to do about a run that is not whole any more
 FILES = ("summary.json", "config.yaml", "trajectory.tum", "odometry.tum", "online.tum", "landmarks.csv",
@@ -48,7 +50,7 @@ ALIKE = 1e-6  # m and of quaternions; between replays on different machines
 RESULT_BAG = "run.mcap"
 INPUTS = "inputs"  # a folder of symbolic links
 DRAWN = ("trajectory.png", "report.html", "unguarded.tum", HISTORY, RESULT_BAG)  # by the command line
-MAYBE = (*DRAWN, FIXES)  # files that not every run has
+MAYBE = (*DRAWN, FIXES, STATES)  # files that not every run has
 
 
 def write_run(result: Result, out: Path | str) -> None:
@@ -77,6 +79,8 @@ def write_run(result: Result, out: Path | str) -> None:
     write_map(out / MAP, result.run.backend.saved(result.run.online, result.summary["run_hash"]))
     if (compared := result.run.backend.compared(snapshot)) is not None:
         write_fixes(out / FIXES, compared)
+    if len(snapshot.states.stamps):
+        write_states(out / STATES, snapshot.states)
     summary = json.dumps(result.summary, indent=1)
     (out / "summary.json").write_text(summary + "\n", encoding="utf-8")
 
@@ -272,6 +276,10 @@ class FinishedRun:
     @property
     def indices(self) -> Stamps:
         return self.linearized.indices
+
+    @cached_property
+    def states(self) -> States:
+        return read_states(self.path / STATES)
 
     @property
     def landmarks(self) -> Mapping[str, Array]:

@@ -13,7 +13,7 @@ from ..core.graph import Decision
 from ..core.measurement import Array, format_stamp
 from ..core.query import Known, Unknown
 from ..core.space import SPACES
-from ..core.trajectory import Snapshot, Stamps, Trajectory
+from ..core.trajectory import Snapshot, Stamps, States, Trajectory
 from ..io.feeder import Feeder
 from ..io.historian import Historian, Question
 
@@ -50,6 +50,10 @@ class Believed:
     @property
     def odometry(self) -> Trajectory:
         return self._snapshot.odometry
+
+    @property
+    def states(self) -> States:
+        return self._snapshot.states
 
     @cached_property
     def landmarks(self) -> Mapping[str, Array]:

@@ -14,7 +14,7 @@ from slam_backend.core.geometry import covariance_from_ros
 from slam_backend.core.measurement import SECOND, Array
 from slam_backend.core.query import FORMS, Answer, Moment, Unknown, answers, question
 from slam_backend.core.space import SPACES
-from slam_backend.core.trajectory import Stamps, Trajectory, shaped
+from slam_backend.core.trajectory import Stamps, States, Trajectory, shaped
 
 NOISE = OdometrySource(noise="pose", sigma_translation_per_meter=0.1)
 TURNED = [0.0, 0, np.sin(0.3), np.cos(0.3)]
@@ -33,6 +33,9 @@ class World:
     indices: Stamps = field(default_factory=lambda: np.array([0, 2, 1], dtype=np.int64))
     landmarks: Mapping[str, Array] = field(default_factory=lambda: {"tag36h11:5": np.array([1.0, 2, 3])})
     asked: list[int] = field(default_factory=list)
+    states: States = field(
+        default_factory=lambda: States(np.array([SECOND, 2 * SECOND]), np.arange(18.0).reshape(2, 9))
+    )
 
     @property
     def space(self) -> Any:
@@ -94,7 +97,7 @@ def test_a_moment_is_a_stamp_in_whole_nanoseconds_now_or_a_keyframe(text: str, m
 @pytest.mark.parametrize(
     "name",
     ["", "pose", "pos@1.0", "Pose@now", "pose@1.0,2.0", "pose@now#covariance", "pose@now#", "between@now", "pose/now",
-     "between@1,2,3", "between@1,2#cov", "landmark/", "landmark", "decision/", "velocity@now", "@now", "map@now",
+     "between@1,2,3", "between@1,2#cov", "landmark/", "landmark", "decision/", "velocity@now#cov", "@now", "map@now",
      "map@now/", "map@1/map@2/pose@now", "map@1/pose", "map@1"],
 )  # fmt: skip
 def test_a_name_of_no_known_form_is_answered_with_the_forms(name: str) -> None:
@@ -239,3 +242,13 @@ def test_a_name_may_ask_what_was_believed_at_another_moment() -> None:
     )
     with pytest.raises(BadConfig, match="'now-ish' is no moment"):
         question("map@now-ish/pose@now")
+
+
+def test_velocity_and_bias_are_told_where_an_imu_reaches():
+    """At a keyframe and, linearly, between two of them; not where one of the two has none."""
+    at, between, bias, beyond = answers(["velocity@1.0", "velocity@1.25", "bias@k2", "velocity@3.0"], World())
+    np.testing.assert_array_equal(at.value, [0, 1, 2])
+    np.testing.assert_allclose(between.value, [2.25, 3.25, 4.25])
+    np.testing.assert_array_equal(bias.value, np.arange(12.0, 18))
+    assert beyond.value is None
+    assert "no IMU reaches it" in beyond.why

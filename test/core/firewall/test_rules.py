@@ -19,7 +19,7 @@ SOURCE = "\n".join(
 
 def named() -> set[str]:
     """Ids as they stand in the code that judges."""
-    found = set(re.findall(r'"((?:check|settle|recheck|wait|imu)/[a-z_]+)"', SOURCE))
+    found = set(re.findall(r'"((?:check|settle|recheck|wait|imu|gnss)/[a-z_]+)"', SOURCE))
     found |= {f"check/{reason}" for reason in re.findall(r'Fault\(\s*"([a-z_]+)"', SOURCE)}
     for what in re.findall(r'Fault\(\s*f"\{what\}_([a-z_]+)"', SOURCE):
         found |= {f"check/covariance_{what}", f"check/information_{what}"}
@@ -27,6 +27,7 @@ def named() -> set[str]:
         f"check/{note}"
         for note in re.findall(r'"(zero_covariance|covariance_swapped|covariance_capped)"', SOURCE)
     }
+    found |= {f"doubt/{reason}" for reason in re.findall(r'"(unexpected|alone)"', SOURCE)}
     found |= {f"decode/{reason}" for reason in re.findall(r'"(bad_message|unknown_type|oversize)"', SOURCE)}
     return found | {f"*/{reason}" for reason in re.findall(r'"(unknown_frame|uncovered)"', SOURCE)}
 
