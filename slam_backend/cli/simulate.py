@@ -2,7 +2,7 @@
 
 import json
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -53,9 +53,9 @@ def _options(settings: list[str]) -> "Options":
     from ..core.errors import BadConfig
     from ..lab.options import Options
 
-    known = {field.name: int if isinstance(field.default, int) else float for field in fields(Options)}
+    known: dict[str, Any] = {field.name: type(field.default) for field in fields(Options)}
     known["landmarks"] = int  # its default is None: what the world has
-    values: dict[str, float] = {}
+    values: dict[str, float | str] = {}
     for setting in settings:
         name, equals, text = setting.partition("=")
         if name not in known:

@@ -137,6 +137,17 @@ class Applier:
         members = self._parts.members(part)
         return {key: moved(shift, key, value_in(space, values, key)) for key in members}
 
+    def renew(self, delta: Delta) -> bool:
+        """Put factors in the place of those with the same ids: the same measurements, with other constants. False: it cannot be solved."""
+        try:
+            self.estimate = self._solver.update(delta)
+        except SolverFailure as failure:
+            self.decisions += [_kept(self._solver.factors[id_], failure) for id_ in delta.remove[:1]]
+            return False
+        finally:
+            self.decisions += self._solver.incidents()
+        return True
+
     def replace(
         self, estimate: Estimate, parts: Parts, added: Sequence[Factor], removed: Sequence[str]
     ) -> None:

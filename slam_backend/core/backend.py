@@ -1,7 +1,7 @@
 """The back-end: measurements in, small updates out, snapshots when asked. No clock, no file, no thread, no ROS."""
 
 from collections import defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -13,6 +13,7 @@ from .adopted import Adopted
 from .apply import Applier, without
 from .association import Associator
 from .beside import Beside
+from .calibration import Calibration
 from .command import Command
 from .config import Config, GnssSource, LandmarkSource, OdometrySource, PoseSource, RelativeSource
 from .consistency import Fit
@@ -58,7 +59,7 @@ from .settle import FAR
 from .solvers import SOLVERS, Solver
 from .space import SPACES
 from .trajectory import Snapshot, States, Trajectory
-from .variables import moved
+from .variables import moved, value_in
 from .waiting import Waiting, refusal
 
 STEP = SECOND // 20  # ns between samples of the track where the IMU drives
@@ -136,6 +137,8 @@ class Backend:
             if isinstance(source, LandmarkSource)
         }
         self._waiting = Waiting(config)
+        self.calibration = Calibration(config, space)
+        self._waiting.late = self.calibration.late
         self._is_complete = False  # nothing was offered since the last keyframes along edges were made
         self._growth = Growth(space, self.timeline, self.track, self.parts)
         self._decisions: list[Decision] = []  # told with the next update
@@ -210,6 +213,8 @@ class Backend:
         if not self._relative and self._newest and self.track.newest > self._newest[0].stamp:
             updates += self._extend(self.track.newest)
         updates += self._close(last=True)
+        if self._newest and self.calibration:
+            self._calibrate(self._newest[0].stamp)
         while self._newest and self._waiting:  # what was waiting for that, or was put back
             updates += self._close(last=True)
         self._decisions += self._waiting.leftovers()
@@ -393,7 +398,9 @@ class Backend:
         else:
             b, delta = self._growth.follow(a, stamp), Delta()
         motion = [Offer("", Measurement(stamp, driver), motion=True)]
-        delta += SENSORS[settings.kind].factors(motion, a, b, self._context({}), settings)
+        delta += SENSORS[settings.kind].factors(
+            motion, a, b, self.calibration.context(self._context({}), driver), settings
+        )
         if settings.kind == "imu" and stretch is not None:
             self._follow(stretch)
         self._newest = (b, self.track.pose(stamp))
@@ -477,11 +484,12 @@ class Backend:
         deltas: list[Delta] = []
         for name, source in self.config.sources.items():
             if name in by_source:
-                context, offers = self._context(guesses), by_source[name]
+                context, offers = self.calibration.context(self._context(guesses), name), by_source[name]
                 if associator := self._associators.get(name):
                     offers, decisions = associator.named(offers, a, b, context)
                     offers, refused = self._quarantine.let_in(offers, self._landmarks)
                     self._decisions += decisions + refused
+                self.calibration.keep(offers)
                 deltas.append(SENSORS[source.kind].factors(offers, a, b, context, source))
                 guesses = {**guesses, **deltas[-1].values}  # what one has found is there for the next
         return total(deltas)
@@ -567,6 +575,8 @@ class Backend:
                 late = {key: guess for key, guess in delta.values.items() if key not in sure.values}
                 self._hear(Delta(judged, values=late))
             self._reunite()
+            if self.calibration.is_due(len(self.timeline)):
+                self._calibrate(b.stamp)
         except SolverFailure:
             self._give_up(delta, new, window)
         return [self._told(b, delta.values.get(b.pose))] if self.timeline.at(b.stamp) is b else []
@@ -579,6 +589,48 @@ class Backend:
         if delta.remove:
             for key in self._quarantine.left(self.estimate.knows):
                 self.parts.drop(key)
+
+    def _calibrate(self, stamp: int) -> None:
+        """Estimate the constants of the sensors with the graph, and put better ones in force: in what is there and what will come.
+
+        Variables are moved only where iSAM2 would not follow by itself.
+        """
+        believed = self.estimate.values()
+        vector, values, decisions = self.calibration.estimate(
+            self.solver.factors, believed, self._with, stamp
+        )
+        self._decisions += decisions
+        if not self.calibration.matters(vector):
+            return
+        made, found = self._with(vector, vector), {}
+        if np.abs(believed.localCoordinates(values).vector()).max() > self.config.isam2.relinearize_threshold:
+            found = {key: value_in(self.space, values, key) for key in values.keys()}  # noqa: SIM118  # gtsam's Values
+        if self._applier.renew(Delta(tuple(made.values()), tuple(made), found)):
+            self.calibration.take(vector)
+            self._waiting.late = self.calibration.late
+
+    def _with(self, constants: Array, anchor: Array) -> dict[str, Factor]:
+        """The factors in the graph that rest on constants of their sensors, made with these. anchor: see Calibration.context."""
+        found: dict[str, Factor] = {}
+        for name in sorted(self.calibration.sources):
+            settings = self.config.sources[name]
+            context = self.calibration.context(self._context({}), name, constants, anchor)
+            make, last = SENSORS[settings.kind].factors, self.timeline.keyframes[-1]
+            if name == self._driver:
+                deltas = [make([offer], a, b, context, settings) for offer, a, b in self._steps(name)]
+            else:
+                landed = [offer for offer in self.calibration.offers(name) if offer.id in self.solver.factors]
+                deltas = [make(landed, None, last, context, settings)]
+            made = (factor for delta in deltas for factor in delta.add)
+            found |= {factor.id: factor for factor in made if factor.id in self.solver.factors}
+        return found
+
+    def _steps(self, name: str) -> Iterator[tuple[Offer, Keyframe, Keyframe]]:
+        """What the motion factors of a source were made from."""
+        for factor in self.solver.factors.values():
+            if factor.kind == "motion" and factor.source == name:
+                a, b = (self.timeline.keyframes[symbolIndex(key)] for key in factor.keys)
+                yield Offer("", Measurement(b.stamp, name)), a, b
 
     def _reunite(self) -> None:
         """Join parts that have come to know enough of the same landmarks."""
@@ -598,7 +650,11 @@ class Backend:
         context = replace(self._context({}), component=lambda _: found.to)
         deltas = [
             SENSORS["landmark"].factors(
-                offers, None, self.timeline.keyframes[-1], context, self.config.sources[name]
+                offers,
+                None,
+                self.timeline.keyframes[-1],
+                self.calibration.context(context, name),
+                self.config.sources[name],
             )
             for name, offers in by_source.items()
         ]

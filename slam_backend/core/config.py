@@ -264,6 +264,19 @@ class Observing(Source):
     )
 
 
+class Mounted(Observing):
+    """A source whose sensor has a place on the robot and a clock, both of which may be a little wrong."""
+
+    time_offset: float = Field(
+        0.0, ge=-10, le=10, description="seconds that are added to the stamps of its messages"
+    )
+    calibrate: tuple[Literal["time_offset", "mount", "translation", "rotation"], ...] = Field(
+        (),
+        description="constants that are estimated with the map. time_offset; translation, rotation, mount (both) of the sensor's "
+        "frame",
+    )
+
+
 class OdometrySource(Source):
     """Pose of the base, or of a sensor on it, in a drifting frame. The first odometry source drives the keyframes; others add edges
     between them.
@@ -296,6 +309,15 @@ class OdometrySource(Source):
         False,
         description="space 3d: only x, y and yaw of its motion are known (wheels); the rest is left to others",
     )
+    distance_scale: float = Field(
+        1.0, gt=0.1, lt=10, description="how many times too long its distances are; of the one that drives"
+    )
+    turn_scale: float = Field(
+        1.0, gt=0.1, lt=10, description="how many times too large its turns are; of the one that drives"
+    )
+    calibrate: tuple[Literal["distance_scale", "turn_scale"], ...] = Field(
+        (), description="constants that are estimated with the map; of the one that drives"
+    )
     max_speed: float = Field(100.0, gt=0, description="m/s; a faster step is a teleport and is refused")
     sigma_acceleration: float = Field(
         1.0,
@@ -318,7 +340,7 @@ class RelativeSource(Observing):
     )
 
 
-class LandmarkSource(Observing):
+class LandmarkSource(Mounted):
     """Observations of landmarks, with ids or without."""
 
     kind: Literal["landmark"] = "landmark"
@@ -353,6 +375,11 @@ class LandmarkSource(Observing):
         description="m around a sighting in which its landmark is looked for, and by which a consensus of sightings may correct the "
         "pose where fewer than half find their landmark",
     )
+    calibrate: tuple[Literal["range_scale", "time_offset", "mount", "translation", "rotation"], ...] = Field(  # type: ignore[assignment]  # one more
+        (),
+        description="constants that are estimated with the map. range_scale; time_offset; translation, rotation, mount (both) of "
+        "the sensor's frame",
+    )
     sigma_position: float = Field(
         0.1, gt=0, le=1e6, description="m, for positions without noise of their own"
     )
@@ -362,7 +389,7 @@ class LandmarkSource(Observing):
     )
 
 
-class PoseSource(Observing):
+class PoseSource(Mounted):
     """Absolute pose of the base in the map frame (a localizer, /initialpose)."""
 
     kind: Literal["pose"] = "pose"
@@ -374,7 +401,7 @@ class PoseSource(Observing):
     )
 
 
-class GnssSource(Observing):
+class GnssSource(Mounted):
     """Positions on the earth. The lever arm is the mounting of the message's frame (extrinsics)."""
 
     kind: Literal["gnss"] = "gnss"

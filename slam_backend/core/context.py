@@ -16,6 +16,21 @@ from .space import Space
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class Correction:
+    """The constants of a source, as configured or as calibrated.
+
+    range_scale, distance_scale, turn_scale: how many times too large. time_offset: s to add to its stamps. mount:
+    `frame_T_true`, of the sensor's frame; None: it sits where it is said to.
+    """
+
+    range_scale: float = 1.0
+    distance_scale: float = 1.0
+    turn_scale: float = 1.0
+    time_offset: float = 0.0
+    mount: Pose | None = None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class Context:
     """Read-only view of the back-end at one keyframe.
 
@@ -45,6 +60,7 @@ class Context:
     has_datum: bool = False
     stretch: Stretch | None = None
     by_imu: bool = False
+    correction: Correction = Correction()
 
     def known(self, key: int) -> bool:
         """Whether a variable is in the graph, or about to enter."""
@@ -78,7 +94,7 @@ class Context:
         mount = self.mounts.get(frame)
         if mount is None:
             raise unknown_frame(frame)
-        return mount
+        return mount if self.correction.mount is None else mount.compose(self.correction.mount)
 
 
 def unknown_frame(frame: str) -> "Unusable":

@@ -3,7 +3,7 @@
 from array import array
 from bisect import bisect_left
 from collections import Counter, defaultdict
-from collections.abc import Callable, Collection, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from heapq import heappop, heappush
 from itertools import islice
 
@@ -28,6 +28,7 @@ class Waiting:
         self._undetermined: dict[int, list[Wait]] = defaultdict(list)
         self._waits = 0  # ever
         self._tallies: dict[str, _Tally] = defaultdict(_Tally)
+        self.late: Mapping[str, int] = {}  # ns that are added to the stamps of a source
 
     def __bool__(self) -> bool:
         return bool(self._pending)
@@ -71,7 +72,7 @@ class Waiting:
 
     def window(self, until: int) -> list[Offer]:
         """Take what lands at a keyframe with this stamp, late measurements included."""
-        return self._take(lambda measurement: measurement.stamp <= until)
+        return self._take(lambda m: m.stamp + self.late.get(m.source, 0) <= until)
 
     def of(self, source: str) -> list[Offer]:
         """Take all that one source has offered."""

@@ -375,6 +375,10 @@ class Result:
                 "final": cost(self.factors, self.values),
             },
             "consistency": {source: each.as_json() for source, each in self.consistency.items()},
+            "calibration": {
+                source: {name: found._asdict() for name, found in constants.items()}
+                for source, constants in run.backend.calibration.found.items()
+            },
             "batch": None if run.batch is None else _told(run.batch),
             "timing": run.seconds.summary(),
             "memory_mb": round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024, 1),

@@ -1,9 +1,17 @@
 """What a simulated drive is like: how long, how good the sensors are, what the channel does to messages."""
 
 from dataclasses import dataclass, fields
+from typing import Literal, get_args
 
 from ..core.errors import BadConfig
 
+Form = Literal["position", "bearing_range", "bearing", "range"]
+FORMS: tuple[str, ...] = get_args(Form)
+POSITIVE = (
+    "loop_sigma_translation", "loop_sigma_rotation", "landmark_sigma", "landmark_sigma_bearing", "range_scale",
+    "gyroscope_density", "gyroscope_walk", "gyroscope_bias",
+    "accelerometer_density", "accelerometer_walk", "accelerometer_bias", "gnss_sigma",
+)  # fmt: skip
 _FRACTIONS = ("loop_rate", "wrong_loop_rate", "dropout", "late", "duplicated")
 
 
@@ -28,7 +36,10 @@ class Options:
     wrong_loop_rate: float = 0.0  # fraction of the loops that join two different places
     landmarks: int | None = None  # how many there are; None: as many as the scenario has
     landmark_range: float = 8.0  # m: how far they are seen
-    landmark_sigma: float = 0.1  # m, on each axis
+    landmark_form: Form = "position"  # what is told of one: position, bearing_range, bearing or range
+    landmark_sigma: float = 0.1  # m, on each axis, or of the range
+    landmark_sigma_bearing: float = 0.01  # rad
+    range_scale: float = 1.0  # how many times too long the ranges are
     imu_rate: float = 0.0  # samples per second of an IMU at the base; 0: it has none
     gyroscope_density: float = 5e-4  # rad/s/sqrt(Hz), white noise
     gyroscope_walk: float = 2e-5  # rad/s^2/sqrt(Hz), of its bias
@@ -51,8 +62,12 @@ class Options:
 
     def __post_init__(self) -> None:
         """BadConfig names the option that makes no sense."""
+        if self.landmark_form not in FORMS:
+            raise BadConfig(f"landmark_form: is one of {', '.join(FORMS)} (it says {self.landmark_form})")
         for field in fields(self):
             value = getattr(self, field.name)
+            if isinstance(value, str):
+                continue
             if value is not None and not 0 <= value < float("inf"):
                 raise BadConfig(f"{field.name}: must be finite and not negative (it says {value})")
             if field.name in _FRACTIONS and value > 1:
@@ -65,17 +80,6 @@ class Options:
             )
         if self.period < 1e-6:
             raise BadConfig(f"period: must be at least 1e-6 s (it says {self.period})")
-        for name in (
-            "loop_sigma_translation",
-            "loop_sigma_rotation",
-            "landmark_sigma",
-            "gyroscope_density",
-            "gyroscope_walk",
-            "gyroscope_bias",
-            "accelerometer_density",
-            "accelerometer_walk",
-            "accelerometer_bias",
-            "gnss_sigma",
-        ):
+        for name in POSITIVE:
             if getattr(self, name) == 0:
                 raise BadConfig(f"{name}: must be greater than 0")

@@ -1,6 +1,6 @@
 """What the sensors of a simulated robot say: the truth with exactly the noise that their covariances state."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -21,6 +21,9 @@ ORIGIN = (48.7, 9.1, 400.0)  # of the map on the earth: degrees, degrees, m
 CAMERA = "camera"  # the frame of the sensor that sees landmarks
 LOOP_AFTER = 50  # messages: what was seen more recently is motion, not a return
 LANDMARKS_EVERY = 5  # odometry messages
+AXES: Mapping[str, slice] = {  # of azimuth, elevation, range: what a form tells
+    "bearing_range": slice(0, 3), "bearing": slice(0, 2), "range": slice(2, 3),
+}  # fmt: skip
 HALF_VIEW = np.pi / 3  # rad, of a camera to either side
 
 
@@ -124,21 +127,33 @@ def sightings(
     truth: Array, landmarks: Array, camera: Array | None, stamps: list[int], options: Options, rng: Generator
 ) -> Iterator[tuple[LandmarkObservation, ...]]:
     """All landmarks in range and view of the (4, 4) camera in the base, or all around the base, at every fifth pose."""
-    frame = BASE if camera is None else CAMERA
+    frame, form = BASE if camera is None else CAMERA, options.landmark_form
     sensors = truth[::LANDMARKS_EVERY] @ (np.eye(4) if camera is None else camera)
-    covariance = frozen(np.eye(3) * options.landmark_sigma**2)
+    sigmas = np.array([options.landmark_sigma_bearing] * 2 + [options.landmark_sigma * options.range_scale])
+    sigmas = sigmas[AXES[form]] if form in AXES else np.full(3, options.landmark_sigma)
+    covariance = frozen(np.diag(sigmas**2))
     for stamp, sensor in zip(stamps[::LANDMARKS_EVERY], sensors, strict=True):
         points = (landmarks - sensor[:3, 3]) @ sensor[:3, :3]
         visible = np.linalg.norm(points, axis=1) < options.landmark_range
         if camera is not None:
             visible &= np.abs(np.arctan2(points[:, 1], points[:, 0])) < HALF_VIEW
         ids = np.flatnonzero(visible)
-        seen = points[ids] + options.landmark_sigma * rng.standard_normal((len(ids), 3))
+        noise = rng.standard_normal((len(ids), 3))
+        seen = points[ids] if form not in AXES else _polar(points[ids], options.range_scale)[:, AXES[form]]
+        seen = seen + sigmas * noise[:, : len(sigmas)]
         if len(ids):
             yield tuple(
-                LandmarkObservation(stamp, "landmarks", frame, str(n), "position", frozen(point), covariance)
-                for n, point in zip(ids, seen, strict=True)
+                LandmarkObservation(stamp, "landmarks", frame, str(n), form, frozen(value), covariance)
+                for n, value in zip(ids, seen, strict=True)
             )
+
+
+def _polar(points: Array, scale: float) -> Array:
+    """(N, 3) points to azimuth, elevation and range."""
+    x, y, z = points.T
+    return np.stack(
+        [np.arctan2(y, x), np.arctan2(z, np.hypot(x, y)), scale * np.linalg.norm(points, axis=1)], axis=1
+    )
 
 
 def arm_of(options: Options) -> Array:

@@ -45,6 +45,10 @@ LATENCY = {
     "/imu": 0,
     "/fix": 80_000_000,
 }  # ns
+TOLD = {  # fields of a cloud, by what is told of a landmark
+    "position": ("x", "y", "z"), "bearing_range": ("azimuth", "elevation", "range"),
+    "bearing": ("azimuth", "elevation"), "range": ("range",),
+}  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -149,8 +153,9 @@ def _record(sent: Sent) -> Record:
             "id": np.array([int(seen.landmark) for seen in item], dtype=np.uint32)
         }
         values = np.stack([seen.value for seen in item])
-        columns |= {axis: values[:, k] for k, axis in enumerate("xyz")}
-        columns["sigma"] = np.sqrt([seen.covariance[0, 0] for seen in item])
+        sigmas = np.sqrt([np.diag(seen.covariance) for seen in item])
+        columns |= {axis: values[:, k] for k, axis in enumerate(TOLD[item[0].form])}
+        columns |= {f"sigma_{axis}": sigmas[:, k] for k, axis in enumerate(TOLD[item[0].form])}
         data = encode_cloud(item[0].stamp, item[0].frame, columns)
         return Record(sent.topic, CLOUD, sent.arrival, data)
     if isinstance(item, ImuSample):
@@ -185,7 +190,13 @@ def _settings(world: Scenario, options: Options, topics: set[str]) -> dict[str, 
             "sigma_translation": options.loop_sigma_translation,
             "sigma_rotation": options.loop_sigma_rotation,
         },
-        "landmarks": {"kind": "landmark", "topic": "/landmarks", "sigma_position": options.landmark_sigma},
+        "landmarks": {
+            "kind": "landmark",
+            "topic": "/landmarks",
+            "sigma_position": options.landmark_sigma,
+            "sigma_range": options.landmark_sigma,
+            "sigma_bearing": options.landmark_sigma_bearing,
+        },
         "imu": {"kind": "imu", "topic": "/imu"}
         | {
             f"{part}_{what}": getattr(options, f"{part}_{what}")

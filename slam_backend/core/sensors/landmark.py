@@ -178,7 +178,7 @@ def _placed(
         with suppress(Unusable):  # any more: a keyframe may have been taken back since
             placed = context.landing(m.stamp)
             if context.component(placed.keyframe.pose) == part:
-                seen = _in_space(m, context.space, config)
+                seen = _in_space(m, context, config)
                 sightings.append(sighting(m.form, seen, placed, _mount(m, context, config), context))
                 offers.append(wait.offer)
     found = place(sightings)
@@ -201,7 +201,7 @@ def _sight(offer: Offer, context: Context, config: LandmarkSource, points: dict[
     placed, mount = context.landing(m.stamp), _mount(m, context, config)
     key, pose_key, space = context.landmark(m.landmark), placed.keyframe.pose, context.space
     known = key in points or context.component(key) is not None
-    value, covariance = _in_space(m, space, config)
+    value, covariance = _in_space(m, context, config)
     if key not in points and known and context.component(key) != context.component(pose_key):
         why, seen = "the landmark belongs to a part of the graph that is not connected yet", None
         if m.form not in PLACELESS:
@@ -226,7 +226,7 @@ def as_point(
     m: LandmarkObservation, mount: Pose, motion: Motion | None, space: Space, config: LandmarkSource
 ) -> tuple[Array, Array]:
     """Where a landmark is from the keyframe, and the covariance of that. Not for a bearing alone."""
-    value, covariance = _in_space(m, space, config)
+    value, covariance = _in_space(m, context, config)
     if m.form == "bearing_range":
         value, covariance = space.to_cartesian(value, covariance)
     return moved(value, covariance, mount, motion)
@@ -291,8 +291,9 @@ def moved(point: Array, covariance: Array, mount: Pose, motion: Motion | None) -
     return there, of_pose @ motion.covariance @ of_pose.T + of_point @ covariance @ of_point.T
 
 
-def _in_space(m: LandmarkObservation, space: Space, config: LandmarkSource) -> tuple[Array, Array]:
-    """The value and covariance without the axes that the space lacks, zeros and NaN replaced by the defaults."""
+def _in_space(m: LandmarkObservation, context: Context, config: LandmarkSource) -> tuple[Array, Array]:
+    """The value and covariance without the axes that the space lacks, zeros and NaN replaced by the defaults, ranges to scale."""
+    space, scale = context.space, context.correction.range_scale
     bearing, span = config.sigma_bearing**2, config.sigma_range**2
     defaults = {
         "position": (config.sigma_position**2,) * 3,
@@ -303,10 +304,10 @@ def _in_space(m: LandmarkObservation, space: Space, config: LandmarkSource) -> t
     keep = [k for k in range(len(m.value)) if space.name == "3d" or k != vertical(m.form)]
     covariance = defaulted(m.covariance[np.ix_(keep, keep)], np.diag([defaults[k] for k in keep]))
     value = m.value[keep]
-    if config.range_scale != 1 and m.form in ("range", "bearing_range"):
-        value[-1] /= config.range_scale
-        covariance[-1] /= config.range_scale
-        covariance[:, -1] /= config.range_scale
+    if scale != 1 and m.form in ("range", "bearing_range"):
+        value[-1] /= scale
+        covariance[-1] /= scale
+        covariance[:, -1] /= scale
     return value, covariance
 
 

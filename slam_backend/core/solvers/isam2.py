@@ -128,10 +128,10 @@ class Isam2:
                 raise RuntimeError(
                     f"estimate is not finite, or leaves the world, near variable {gtsam.DefaultKeyFormatter(key)}"
                 )
-        _check_held(self._isam, (key for id_ in delta.remove for key in self.factors[id_].keys))
+        _check_held(self._isam, (key for id_ in _gone(delta) for key in self.factors[id_].keys))
 
     def _commit(self, delta: Delta) -> None:
-        for id_ in delta.remove:
+        for id_ in _gone(delta):
             self.factors.pop(id_, None)
             self._slots.pop(id_, None)
         for factor in delta.add:
@@ -155,7 +155,7 @@ class Isam2:
             self._qr = qr or self._config.factorization == "auto"
             try:
                 self._isam, self._slots = self._climb(list(self._after(delta)), values)
-                _check_held(self._isam, (key for id_ in delta.remove for key in self.factors[id_].keys))
+                _check_held(self._isam, (key for id_ in _gone(delta) for key in self.factors[id_].keys))
             except _Failures:
                 guilty = self._unsolvable(delta, before)
             else:
@@ -320,6 +320,11 @@ class Believed:
             return np.asarray(self._isam.jointMarginalCovariance(list(keys)).fullMatrix())
         except _Failures as error:
             raise SolverFailure(_short(error), ()) from None
+
+
+def _gone(delta: Delta) -> set[str]:
+    """What is removed, and not put back with other numbers."""
+    return set(delta.remove) - {factor.id for factor in delta.add}
 
 
 def _check_held(isam: gtsam.ISAM2, keys: Iterable[int]) -> None:

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from slam_backend.core.config import LandmarkSource
+from slam_backend.core.context import Correction
 from slam_backend.core.errors import BadMessage
 from slam_backend.core.graph import UNTIL_JOINED, Wait
 from slam_backend.core.measurement import SECOND, frozen
@@ -142,7 +143,8 @@ def test_ranges_that_are_too_long_are_divided_by_their_scale(world, offered):
     true = sighting(world, "range", "", AT_KEYFRAME, np.array([[0.01]]))
     long = replace(true, value=frozen(true.value * 1.1), covariance=frozen(true.covariance * 1.1**2))
     (plain,) = factors(offered(true), None, None, world.context(), LandmarkSource()).add
-    (scaled,) = factors(offered(long), None, None, world.context(), LandmarkSource(range_scale=1.1)).add
+    context = replace(world.context(), correction=Correction(range_scale=1.1))
+    (scaled,) = factors(offered(long), None, None, context, LandmarkSource()).add
     assert scaled.factor.measured() == pytest.approx(plain.factor.measured())
     np.testing.assert_allclose(scaled.factor.noiseModel().R(), plain.factor.noiseModel().R())
 
