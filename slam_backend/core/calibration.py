@@ -215,10 +215,7 @@ class Calibration:
         """Gauss-Newton; a step that does not lower the cost is halved."""
         vector, last = self._vector.copy(), np.inf
         made = rebuild(vector, vector)
-        fixed = gtsam.NonlinearFactorGraph()
-        for id_, factor in factors.items():
-            if id_ not in made:
-                fixed.add(factor.factor)
+        fixed = self._others(factors, made)
         step, towards, sigmas, share = (
             np.zeros_like(vector),
             gtsam.VectorValues(),
@@ -237,10 +234,27 @@ class Calibration:
                     break
             vector = at + share * step
             values = here.retract(_times(towards, share))
-            made |= rebuild(
-                vector, vector
-            )  # what lands no more, at an end of the trajectory, stays as it was
+            made |= {id_: factor for id_, factor in rebuild(vector, vector).items() if id_ in made}
         return at, here, sigmas
+
+    def _others(
+        self, factors: Mapping[str, Factor], made: Mapping[str, Factor]
+    ) -> gtsam.NonlinearFactorGraph:
+        """All that does not rest on the constants. Of what does and lands no more with these, at an end of the trajectory, only
+        what holds a variable that nothing else holds: it says what other constants made of it.
+        """
+        graph, held, lost = gtsam.NonlinearFactorGraph(), set[int](), []
+        for id_, factor in factors.items():
+            if id_ not in made and factor.source in self.sources:
+                lost.append(factor)
+                continue
+            held.update(factor.keys)
+            if id_ not in made:
+                graph.add(factor.factor)
+        for factor in lost:
+            if not held.issuperset(factor.keys):
+                graph.add(factor.factor)
+        return graph
 
     def _step(
         self,

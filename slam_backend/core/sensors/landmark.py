@@ -223,12 +223,12 @@ def _sight(offer: Offer, context: Context, config: LandmarkSource, points: dict[
 
 
 def as_point(
-    m: LandmarkObservation, mount: Pose, motion: Motion | None, space: Space, config: LandmarkSource
+    m: LandmarkObservation, mount: Pose, motion: Motion | None, context: Context, config: LandmarkSource
 ) -> tuple[Array, Array]:
     """Where a landmark is from the keyframe, and the covariance of that. Not for a bearing alone."""
     value, covariance = _in_space(m, context, config)
     if m.form == "bearing_range":
-        value, covariance = space.to_cartesian(value, covariance)
+        value, covariance = context.space.to_cartesian(value, covariance)
     return moved(value, covariance, mount, motion)
 
 
