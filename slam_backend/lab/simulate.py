@@ -155,7 +155,10 @@ def _record(sent: Sent) -> Record:
         values = np.stack([seen.value for seen in item])
         sigmas = np.sqrt([np.diag(seen.covariance) for seen in item])
         columns |= {axis: values[:, k] for k, axis in enumerate(TOLD[item[0].form])}
-        columns |= {f"sigma_{axis}": sigmas[:, k] for k, axis in enumerate(TOLD[item[0].form])}
+        if (sigmas == sigmas[:, :1]).all():
+            columns["sigma"] = sigmas[:, 0]
+        else:
+            columns |= {f"sigma_{axis}": sigmas[:, k] for k, axis in enumerate(TOLD[item[0].form])}
         data = encode_cloud(item[0].stamp, item[0].frame, columns)
         return Record(sent.topic, CLOUD, sent.arrival, data)
     if isinstance(item, ImuSample):
@@ -190,13 +193,7 @@ def _settings(world: Scenario, options: Options, topics: set[str]) -> dict[str, 
             "sigma_translation": options.loop_sigma_translation,
             "sigma_rotation": options.loop_sigma_rotation,
         },
-        "landmarks": {
-            "kind": "landmark",
-            "topic": "/landmarks",
-            "sigma_position": options.landmark_sigma,
-            "sigma_range": options.landmark_sigma,
-            "sigma_bearing": options.landmark_sigma_bearing,
-        },
+        "landmarks": {"kind": "landmark", "topic": "/landmarks", "sigma_position": options.landmark_sigma},
         "imu": {"kind": "imu", "topic": "/imu"}
         | {
             f"{part}_{what}": getattr(options, f"{part}_{what}")
