@@ -121,7 +121,9 @@ class Backend:
         self.tracks = Tracks(self.track)
         self.timeline = Timeline()
         self.parts = Parts()
-        self.origin = config.earth.origin  # of east, north, up: latitude, longitude, altitude
+        self.origin: Sequence[float] | None = (
+            config.earth.origin
+        )  # of east, north, up: latitude, longitude, altitude
         self.fixes = Fixes()
         self._mounts = Mounts(space, config.base_frame, config.extrinsics)
         self._beside = {
@@ -168,6 +170,7 @@ class Backend:
         self._waiting.remember(factor.id for factor in saved.factors if factor.kind != "gauge")
         self._growth.begins = saved.end
         self._revision = saved.revision
+        self.origin = saved.origin or self.origin
 
     def saved(self, online: Trajectory, run_hash: str = "") -> SavedMap:
         """What another session needs to go on from here. online: what was believed of each keyframe when it was newest."""
@@ -176,6 +179,7 @@ class Backend:
             self.space.name, tuple(self.solver.factors.values()), self.estimate.values(), keyframes,
             dict(self._landmarks), dict(self.parts.all()), dict(self._applier.sighted),
             tuple(track.samples() for track in self.tracks if len(track)), online, self._revision, run_hash,
+            None if self.origin is None else tuple(self.origin),
         )  # fmt: skip
 
     def add(self, measurement: Measurement) -> list[Update]:

@@ -19,7 +19,8 @@ class SavedMap:
 
     values: of every variable. keyframes: in order of index. landmarks: name -> key. parts: variable -> number of its
     component. sighted: variable other than a keyframe's pose -> the first pose that it was tied to, and the value from there. tracks: the odometry of each session, in
-    order of time. online: what was believed of each keyframe when it was newest.
+    order of time. online: what was believed of each keyframe when it was newest. origin: of the earth, latitude, longitude,
+    altitude; None for a map without fixes.
     """
 
     space: str
@@ -33,6 +34,7 @@ class SavedMap:
     online: Trajectory
     revision: int
     run_hash: str = field(default="")
+    origin: tuple[float, ...] | None = None
 
     @property
     def end(self) -> int:

@@ -9,6 +9,7 @@
     keys, parts                     (V,) the component of each variable
     seen, seen_from, seen_at        (S,) variables other than keyframes, the first pose that each was tied to, and (bytes) values from there
     track_sizes, track_stamps, track_numbers, track_strands, track_covariances    the odometry of each session, one after the other
+    origin                          of the earth: latitude, longitude, altitude; (0,) for a map without fixes
     online_stamps, online_sevens    what was believed of each keyframe when it was newest
 
 graph.g2o cannot serve: it has no gauges, kernels, ids, bearings. gtsam's own text keeps every number to the bit.
@@ -44,6 +45,7 @@ def write_map(path: Path, saved: SavedMap) -> None:
     np.savez_compressed(
         path,
         version=VERSION, space=saved.space, revision=saved.revision, run_hash=saved.run_hash,
+        origin=np.array(saved.origin or (), dtype=np.float64),
         graph=_packed(graph.serialize()), values=_packed(saved.values.serialize()),
         ids=_texts(factor.id for factor in saved.factors),
         kinds=_texts(factor.kind for factor in saved.factors),
@@ -127,6 +129,7 @@ def _map(arrays: dict[str, Any]) -> SavedMap:
         {key: (pose, value_in(space, seen, key)) for key, pose in sighted},
         _tracks(arrays), Trajectory(arrays["online_stamps"], arrays["online_sevens"]),
         int(arrays["revision"]), str(arrays["run_hash"]),
+        tuple(arrays["origin"].tolist()) or None if "origin" in arrays else None,
     )  # fmt: skip
 
 

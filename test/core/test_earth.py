@@ -6,6 +6,7 @@ import pytest
 from slam_backend.core.graph import DATUM, EARTH
 from slam_backend.core.measurement import SECOND, frozen
 from slam_backend.core.sensors.pose import AbsolutePose
+from slam_backend.core.sensors.relative import RelativePose
 from slam_backend.core.space import SPACES
 
 
@@ -95,3 +96,24 @@ def test_before_the_map_has_a_place_on_the_earth_nothing_is_compared_with_the_fi
     assert found.earth() is None
     assert np.isnan(found.compared(found.snapshot()).antennas).all()
     assert road.backend(space).compared(None) is None
+
+
+def test_a_session_goes_on_on_the_same_earth_once_it_has_found_the_map(road, space):
+    """Its fixes wait until a loop has joined it to the map; then they hold it where the first session's held that."""
+    items, truth = road.drive(space)
+    first = road.backend(space, earth={"origin": road.origin})
+    road.run(first, items[:120])
+    second = road.backend(space, sources={"loops": {"kind": "relative"}}, robust=[])
+    second.load(first.saved(first.snapshot().trajectory))
+    assert second.origin == road.origin
+    shape = SPACES[space]
+    there = frozen(shape.seven(truth[10].between(truth[80])))
+    stamps = (11 * SECOND, 81 * SECOND)
+    loop = RelativePose(
+        81 * SECOND, "loops", *stamps, "base", "base", there, frozen(np.eye(6).reshape(36) * 1e-4)
+    )
+    later = [item for item in items[120:] if item.stamp > 60 * SECOND]
+    road.run(second, sorted([*later, loop], key=lambda item: item.stamp))
+    assert len(second.parts) == 1
+    assert sum(f.kind == "gnss" for f in second.solver.factors.values()) > 100
+    assert np.sqrt(np.mean(road.errors(second, truth) ** 2)) < 0.3
