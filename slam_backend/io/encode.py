@@ -151,11 +151,11 @@ def _transform(message: _Bytes, stamp: int, frame: str, child: str, seven: Array
     message.doubles(seven, 7)
 
 
-def encode_fix(stamp: int, frame: str, place: ArrayLike, covariance: ArrayLike) -> bytes:
-    """sensor_msgs/NavSatFix with a fix of GPS. place: latitude, longitude (degrees), altitude (m); covariance: (3, 3), known."""
+def encode_fix(stamp: int, frame: str, place: ArrayLike, covariance: ArrayLike, status: int = 0) -> bytes:
+    """sensor_msgs/NavSatFix with a fix of GPS; status: of NavSatStatus. place: latitude, longitude (degrees), altitude (m); covariance: (3, 3), known."""
     message = _Bytes()
     message.header(stamp, frame)
-    message.add(pack("<b", 0))  # STATUS_FIX
+    message.add(pack("<b", status))
     message.add(pack("<H", 1), 2)  # SERVICE_GPS
     message.doubles(place, 3)
     message.doubles(covariance, 9)

@@ -40,7 +40,7 @@ from ..io.encode import encode_cloud, encode_odometry
 from ..io.formats import tum
 from ..io.formats.trajectory import Trajectory
 from ..io.records import Record
-from . import mrclam, pose_graphs, victoria_raw
+from . import mrclam, pose_graphs, rtklib, victoria_raw
 from .gtsam_data import Content, example, lifted, planar, rows, symmetric
 from .kitti import kitti_imu_gnss
 from .matlab import read_arrays
@@ -207,6 +207,7 @@ DATASETS: Mapping[str, Dataset] = {
 }  # fmt: skip
 
 RECORDINGS: Mapping[str, Recording] = {
+    "rtklib": Recording("a receiver's solution (.pos) on /fix, with imu*.csv on /imu", rtklib.read),
     "victoria_park_raw": Recording(
         "a truck among trees as recorded: wheel and steering on /odom, trunks without ids on /trees; 2-D", victoria_raw.read
     ),

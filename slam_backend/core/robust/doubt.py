@@ -7,13 +7,13 @@ agree is judged as if all that had been expected of them might be off by one mot
 innovation given those before it.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import gtsam
 import numpy as np
 
-from ..config import Config, GnssSource
+from ..config import Config, GnssSource, ImuSource
 from ..errors import SolverFailure
 from ..graph import Decision, Delta, Estimate, Factor, Verdict, is_pose
 from ..measurement import SECOND, Array
@@ -23,6 +23,7 @@ from .paths import Paths
 from .stage import Judged
 
 ASTRAY, TURNED = 1e3, 0.5  # m and rad: by how much what is expected may be off
+SPEED = 10.0  # m/s
 MOST = 100  # doubted fixes of one source that are remembered
 
 
@@ -32,6 +33,8 @@ class Doubt:
     def __init__(self, config: Config, paths: Paths) -> None:
         self._sources = {n: s for n, s in config.sources.items() if isinstance(s, GnssSource)}
         self._paths, self._axes = paths, paths.space.point_dimension
+        driver = config.sources.get(config.driver or "")
+        self._astray_speed = SPEED if isinstance(driver, ImuSource) else 0.0
         self._doubted: dict[str, list[Factor]] = {name: [] for name in self._sources}
 
     def admit(self, proposed: Delta, estimate: Estimate) -> Judged:
@@ -94,7 +97,8 @@ class Doubt:
             return np.full(len(fixes), np.nan)
         size = len(covariance) // len(keys)
         if astray:
-            covariance = covariance + self._together(keys, estimate)
+            stamps = {key: fix.stamp for fix in fixes for key in fix.keys}
+            covariance = covariance + self._together({key: stamps[key] for key in keys}, estimate)
         jacobian = np.zeros((self._axes * len(fixes), len(covariance)))
         error = np.zeros(self._axes * len(fixes))
         for n, fix in enumerate(fixes):
@@ -110,20 +114,24 @@ class Doubt:
         white = np.linalg.solve(np.linalg.cholesky(joint), error)
         return np.asarray((white.reshape(-1, self._axes) ** 2).sum(axis=1))
 
-    def _together(self, keys: Sequence[int], estimate: Estimate) -> Array:
-        """Covariance of poses, at their tangents, that may all be moved, and turned about the vertical through the first, as one."""
+    def _together(self, stamps: Mapping[int, int], estimate: Estimate) -> Array:
+        """Covariance of poses, at their tangents, that may all be moved, and turned about the vertical through the first, as one; and
+        where an IMU alone drives, whose speed goes astray, left behind at a constant speed. stamps: of the keys, in their order.
+        """
         space = self._paths.space
-        poses = {key: estimate.pose(key) for key in keys if is_pose(key)}
+        poses = {key: estimate.pose(key) for key in stamps if is_pose(key)}
         center = next(iter(poses.values())).translation()
         middle = space.rigid(np.eye(self._axes), center)
         sigmas = np.sqrt(np.diag(space.diagonal(TURNED**2, ASTRAY**2))).copy()
         if space.name == "3d":
             sigmas[:2] = 0.0
         still = np.zeros((space.dimension,) * 2)
-        moved = [
-            poses[k].inverse().compose(middle).AdjointMap() * sigmas if k in poses else still for k in keys
-        ]
-        together = np.vstack(moved)
+        rows = []
+        for key, stamp in stamps.items():
+            moved = poses[key].inverse().compose(middle).AdjointMap() if key in poses else still
+            late = (stamp - min(stamps.values())) / SECOND * self._astray_speed
+            rows.append(np.hstack([moved * sigmas, moved[:, space.translation] * late]))
+        together = np.vstack(rows)
         return np.asarray(together @ together.T)
 
 

@@ -181,7 +181,8 @@ def _first_guess(sights: Array, context: Context) -> Pose | str:
     if settings.yaw is not None:
         yaw, weights = -settings.yaw, np.ones(len(sights))
     else:
-        reach = float(np.linalg.norm(points - points[0], axis=1).max())
+        # A receiver that stands still tells nothing, whatever the odometry does.
+        reach = min(float(np.linalg.norm(path - path[0], axis=1).max()) for path in (points, fixes[:, :2]))
         needed = max(settings.baseline, sqrt(2) * sigma / settings.yaw_within)
         if reach < needed:
             return (
