@@ -92,20 +92,26 @@ class Held:
         return None if cycle is None else self._ruler.compare(self._paths.path_of(one), cycle)
 
     def _around(self, one: Factor, other: Factor) -> Path | None:
-        """From a to b of one loop by way of the other."""
+        """From a to b of one loop by way of the other, whichever way round is shorter."""
         (a, b), (c, d) = one.keys, other.keys
-        leap = self._paths.path_of(other)
+        places = {key: self._paths.place(key) for key in (a, b, c, d)}
         ways = []
-        for first, second, across in ((c, d, leap), (d, c, None)):
-            out, back = self._paths.along(a, first), self._paths.along(second, b)
-            if out is not None and back is not None:
-                ways.append((out.meters + back.meters, out, across or leap.inverse(), back))
+        for first, second in ((c, d), (d, c)):
+            (p, at_a), (q, at_first), (r, at_second), (s, at_b) = (
+                places[key] for key in (a, first, second, b)
+            )
+            if (p, r) == (q, s):
+                ways.append((abs(at_a - at_first) + abs(at_second - at_b), first, second))
         if not ways:
             return None
-        meters, out, across, back = min(ways, key=lambda way: way[0])
+        meters, first, second = min(ways, key=lambda way: way[0])
         if not self._config.apart <= meters <= self._config.reach:
             return None
-        return out.then(across).then(back)
+        leap = self._paths.path_of(other)
+        out, back = self._paths.along(a, first), self._paths.along(second, b)
+        assert out is not None
+        assert back is not None
+        return out.then(leap if first == c else leap.inverse()).then(back)
 
     def clique(self, loop: Factor, size: int, sure: float = np.inf) -> tuple[Factor, ...]:
         """One of that size with the loop in it; else the largest that was found. sure: largest of an agreement that counts (m)."""

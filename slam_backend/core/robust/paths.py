@@ -25,18 +25,31 @@ MEMORY = 4096  # ways remembered
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Path:
-    """A way from a to b: `a_T_b`, and its covariance at the tangent of b by cause.
+    """A way from a to b: `a_T_b`, and its covariance at the tangent of b by cause, so that one product moves all of it.
 
-    odometry: by motion, as stated. rotation: the part of that which is due to its noise of rotation alone. loops: by the loops
-    on the way. meters: of motion. via: ids of the loops, in order.
+    parts: (3, d, d), of motion as stated; of that what is due to its noise of rotation alone; of the loops on the way.
+    meters: of motion. via: ids of the loops, in order.
     """
 
     pose: Pose
-    odometry: Array
-    rotation: Array
-    loops: Array
+    parts: Array
     meters: float
     via: tuple[str, ...] = ()
+
+    @property
+    def odometry(self) -> Array:
+        part: Array = self.parts[0]
+        return part
+
+    @property
+    def rotation(self) -> Array:
+        part: Array = self.parts[1]
+        return part
+
+    @property
+    def loops(self) -> Array:
+        part: Array = self.parts[2]
+        return part
 
     def covariance(self, scale: float, rotation: float = 1.0) -> Array:
         """With the odometry's covariance multiplied by `scale`, and its standard deviations of rotation by `rotation` besides."""
@@ -50,37 +63,22 @@ class Path:
 
     def then(self, other: "Path") -> "Path":
         adjoint = other.pose.inverse().AdjointMap()
-
-        def moved(covariance: Array) -> Array:
-            return np.asarray(adjoint @ covariance @ adjoint.T)
-
-        return Path(
-            self.pose.compose(other.pose),
-            moved(self.odometry) + other.odometry,
-            moved(self.rotation) + other.rotation,
-            moved(self.loops) + other.loops,
-            self.meters + other.meters,
-            self.via + other.via,
-        )
+        parts = adjoint @ self.parts @ adjoint.T + other.parts
+        return Path(self.pose.compose(other.pose), parts, self.meters + other.meters, self.via + other.via)
 
     def inverse(self) -> "Path":
         """`b_T_a`, covariances at the tangent of a."""
         adjoint = self.pose.AdjointMap()
-        odometry, rotation, loops = (
-            np.asarray(adjoint @ part @ adjoint.T) for part in (self.odometry, self.rotation, self.loops)
-        )
-        return Path(self.pose.inverse(), odometry, rotation, loops, self.meters, self.via[::-1])
+        return Path(self.pose.inverse(), adjoint @ self.parts @ adjoint.T, self.meters, self.via[::-1])
 
 
 class Chain:
     """Poses one after the other along motion factors, in a frame of their own, with running sums."""
 
-    def __init__(self, origin: Pose, zero: Array) -> None:
+    def __init__(self, origin: Pose, nothing: Array) -> None:
+        """nothing: parts of a path that does not move."""
         self.poses: list[Pose] = [origin]
-        self.odometry: list[Array] = [
-            zero
-        ]  # sum of the steps' covariances, each carried to the chain's origin
-        self.rotation: list[Array] = [zero]
+        self.parts: list[Array] = [nothing]  # sum over the steps, each carried to the chain's origin
         self.meters = array("d", [0.0])
         self.price = array("d", [0.0])
 
@@ -89,12 +87,9 @@ class Chain:
         back = self.poses[b].inverse()
         first, last = min(a, b), max(a, b)
         adjoint = back.AdjointMap()
-        odometry, rotation = (
-            np.asarray(adjoint @ (sums[last] - sums[first]) @ adjoint.T)
-            for sums in (self.odometry, self.rotation)
-        )
+        parts = adjoint @ (self.parts[last] - self.parts[first]) @ adjoint.T
         pose = self.poses[a].between(self.poses[b])
-        return Path(pose, odometry, rotation, np.zeros_like(odometry), self.meters[last] - self.meters[first])
+        return Path(pose, parts, self.meters[last] - self.meters[first])
 
 
 class Point(NamedTuple):
@@ -119,7 +114,7 @@ class Paths:
         self.space, self.scale, self.factors = space, scale, factors
         self._turns = np.outer(*(np.diag(space.diagonal(1.0, 0.0)),) * 2)  # picks the block of rotation
         self._weights = np.diag(space.diagonal(LEVER**2, 1.0))
-        self._zero = np.zeros((space.dimension,) * 2)
+        self._nothing = np.zeros((3, space.dimension, space.dimension))
         self._fresh: list[Factor] = []  # booked, and not yet read
         self._chains: list[Chain] = []
         self._points: dict[int, Point] = {}
@@ -195,9 +190,13 @@ class Paths:
 
     def path_of(self, factor: Factor) -> Path:
         """A relative measurement as a way of its own."""
+        row = self._links.get(factor.id)
+        if row is not None and (link := self._rows[row]) is not None and link.factor is factor:
+            return link.path
         motion = motion_of(factor)
-        loops = motion.covariance
-        return Path(motion.pose, self._zero, self._zero, loops, 0.0, (factor.id,))
+        parts = self._nothing.copy()
+        parts[2] = motion.covariance
+        return Path(motion.pose, parts, 0.0, (factor.id,))
 
     def _priced(self, point: Point) -> tuple[int, float]:
         return point.chain, self._chains[point.chain].price[point.row]
@@ -222,7 +221,7 @@ class Paths:
 
     def _begin(self, key: int) -> None:
         self._points[key] = Point(len(self._chains), 0)
-        self._chains.append(Chain(self.space.identity, self._zero))
+        self._chains.append(Chain(self.space.identity, self._nothing))
 
     def _extend(self, factor: Factor) -> None:
         a, b = (key for key in factor.keys if is_pose(key))
@@ -237,20 +236,22 @@ class Paths:
             if b not in self._points:
                 self._begin(b)
             self._memory.clear()
-            meters = self.space.size(motion.pose)[0]
-            covariance = motion.covariance
-            path = Path(motion.pose, covariance, covariance * self._turns, self._zero, meters)
+            path = Path(motion.pose, self._walked(motion), self.space.size(motion.pose)[0])
             self._connect(Link(factor, a, b, path))
             return
         self._points[b] = Point(point.chain, point.row + 1)
         pose = chain.poses[-1].compose(motion.pose)
         adjoint = pose.AdjointMap()
         chain.poses.append(pose)
-        chain.odometry.append(chain.odometry[-1] + adjoint @ motion.covariance @ adjoint.T)
-        turns = motion.covariance * self._turns
-        chain.rotation.append(chain.rotation[-1] + adjoint @ turns @ adjoint.T)
+        chain.parts.append(chain.parts[-1] + adjoint @ self._walked(motion) @ adjoint.T)
         chain.meters.append(chain.meters[-1] + self.space.size(motion.pose)[0])
         chain.price.append(chain.price[-1] + self.scale * float(self._weights @ np.diag(motion.covariance)))
+
+    def _walked(self, motion: Motion) -> Array:
+        """Parts of one motion factor."""
+        parts = self._nothing.copy()
+        parts[0], parts[1] = motion.covariance, motion.covariance * self._turns
+        return parts
 
     def _connect(self, link: Link) -> None:
         p, q = self._points[link.a], self._points[link.b]

@@ -21,12 +21,12 @@ from .conftest import ends, vertices
 def path(space, pose, sigma, meters):
     covariance = np.eye(space.dimension) * sigma**2
     turns = np.outer(*(np.diag(space.diagonal(1.0, 0.0)),) * 2)
-    return ways.Path(pose, covariance, covariance * turns, 0 * covariance, meters)
+    return ways.Path(pose, np.array([covariance, covariance * turns, 0 * covariance]), meters)
 
 
 def measured(space, pose, sigma):
     covariance = np.eye(space.dimension) * sigma**2
-    return ways.Path(pose, 0 * covariance, 0 * covariance, covariance, 0.0)
+    return ways.Path(pose, np.array([0 * covariance, 0 * covariance, covariance]), 0.0)
 
 
 @pytest.mark.parametrize("name", ["2d", "3d"])

@@ -72,7 +72,7 @@ def test_what_is_expected_is_exact_only_where_noise_leaves_no_other_place_nearby
     for sigma, statistic in ((0.1, 4.0), (10.0, np.inf)):
         there = space.from_extrinsics((2 * sigma, 0.0, 0.0, 0.0, 0.0, 0.0))
         noise = np.eye(space.dimension) * sigma**2
-        loop = Path(there, 0 * noise, 0 * noise, noise, 0.0)
+        loop = Path(there, np.array([0 * noise, 0 * noise, noise]), 0.0)
         assert ruler.exact(loop, space.identity, 0 * noise) == pytest.approx(statistic)
 
 
