@@ -4,7 +4,7 @@ import os
 import tempfile
 from pathlib import Path
 from statistics import median
-from time import monotonic, process_time
+from time import monotonic, process_time, sleep
 
 import numpy as np
 
@@ -23,7 +23,7 @@ from slam_backend.lab.simulate import Options, simulate
 TITLE = "The journal"
 EXPLANATION = (
     "Laps: a planar robot, odometry at 200 Hz, a keyframe every half metre, a loop every ten seconds. Warehouse: a keyframe, and landmarks, in every message. Cost: CPU seconds of appending and committing (fsync included) "
-    "against the replay of the same journal, decoding and solving included; medians. Rate: wall time until the last record is acknowledged, appended as fast as it goes. Restore: "
+    "against the replay of the same journal, decoding and solving included; medians; in the live node the two are processes of their own. Rate: wall time until the last record is acknowledged, appended as fast as it goes. Restore: "
     "from the start of the worker to the last row applied, against the time that was recorded. Damage: cut in the last 64 KiB, or one "
     "byte flipped anywhere, closed and as a crash leaves it; an answer is wrong if a record is not as it was written, or one is missing without a word "
     "(cut exactly between two commits, a journal is a shorter journal)."
@@ -46,6 +46,7 @@ def rows(minutes: float = 10.0, cuts: int = 2000, flips: int = 500, poses: int =
         return [
             _cost("warehouse", warehouse, config_from(drive.settings), place / "warehouse")[0],
             row,
+            _paced(records[: round(10 * RATE)], place / "paced"),
             Row("rate, group commit", f"{rate:,.0f} /s", "", rate, ">= 20000"),
             Row(
                 "restore, laps",
@@ -82,6 +83,18 @@ def _written(records: list[Record], folder: Path) -> tuple[float, float]:
     journal.close()
     assert journal.committed == len(records)
     return process_time() - cpu, seconds
+
+
+def _paced(records: list[Record], folder: Path) -> Row:
+    """As a robot sends them: a commit, with its fsync, for each ten."""
+    journal = Journal(folder, print)
+    cpu, begin = process_time(), monotonic()
+    for n, record in enumerate(records):
+        sleep(max(begin + n / RATE - monotonic(), 0))
+        journal.append(record.topic, record.type, record.data)
+    journal.close()
+    share = (process_time() - cpu) / (monotonic() - begin)
+    return Row(f"CPU at {RATE:.0f} Hz, as they come", f"{share:.2%} of one core", "", share)
 
 
 def _replayed(path: Path, chosen: Config) -> float:
