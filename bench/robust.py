@@ -102,7 +102,7 @@ def _promised(sequence: str, these: list[Case], measured: Measured) -> Iterator[
         scaled = f"odometry noise x {factor:.2g}"
         settings = {"gate": {"odometry_scale": factor * scale}}
         if runs := measured.of(f"default, {scaled}", configured(settings), these):
-            yield from _kept(f"{name}, {scaled}", runs, 0.95)
+            yield from _kept(f"KITTI {sequence}, {len(runs)} data sets, {scaled}", runs, 0.95)
 
 
 def _undisturbed(case: Case) -> Found:
@@ -212,13 +212,16 @@ def tables(whole: bool, measured: Measured) -> str:
     for title in ("KITTI 00", "KITTI 05", "KITTI 07", *GRAPHS):
         some = [case for case in these if case.name.startswith(f"{title}, ")]
         names = {case.name for case in some}
-        found = {name: [r for case, r in pairs if case.name in names] for name, pairs in runs.items()}
+        found = {
+            name: {case.name: run for case, run in pairs if case.name in names}
+            for name, pairs in runs.items()
+        }
         if any(found.values()):
             lines += _sequence(title, some, found) if title not in GRAPHS else _graph(title, some, found)
     return "\n".join(lines)
 
 
-def _sequence(title: str, these: list[Case], found: dict[str, list[Found]]) -> list[str]:
+def _sequence(title: str, these: list[Case], found: dict[str, dict[str, Found]]) -> list[str]:
     clean = [case.ate_clean for case in these]
     lines = [
         f"**{title}**, worst over the data sets (ATE: odometry {these[0].ate_odometry:.2f} m, exactly the true loops "
@@ -227,8 +230,8 @@ def _sequence(title: str, these: list[Case], found: dict[str, list[Found]]) -> l
         "| strategy | data sets | precision | recall | wrong at the end | at any moment | at arrival | slowest, keyframes | ATE, m | CPU, s | verdict p50 / p99, ms |",
         "|---|---|---|---|---|---|---|---|---|---|---|",
     ]
-    for strategy, runs in found.items():
-        if runs:
+    for strategy, by_case in found.items():
+        if runs := list(by_case.values()):
             lines.append(
                 f"| {strategy} | {len(runs)} | {min(r.precision for r in runs):.1%} | {min(r.recall for r in runs):.1%} | {max(r.wrong for r in runs)} | "
                 f"{_number(max(r.ever for r in runs), '.0f')} | {_number(min(r.prompt for r in runs), '.0%')} | "
@@ -238,7 +241,7 @@ def _sequence(title: str, these: list[Case], found: dict[str, list[Found]]) -> l
     return [*lines, ""]
 
 
-def _graph(title: str, these: list[Case], found: dict[str, list[Found]]) -> list[str]:
+def _graph(title: str, these: list[Case], found: dict[str, dict[str, Found]]) -> list[str]:
     shares = [case.name.partition(", ")[2] for case in these]
     lines = [
         f"**{title}**, {these[0].true.sum()} loops of its own; ATE to its optimum in m, wrong loops kept, recall, CPU in s (odometry: {these[0].ate_odometry:.2f} m)",
@@ -246,11 +249,17 @@ def _graph(title: str, these: list[Case], found: dict[str, list[Found]]) -> list
         "| strategy | " + " | ".join(shares) + " | verdict p50 / p99, ms |",
         "|---" * (len(shares) + 2) + "|",
     ]
-    for strategy, runs in found.items():
-        if len(runs) == len(these):
-            cells = [f"{r.ate:.3f} m, {r.wrong} wrong, {r.recall:.1%}, {r.seconds:.1f} s" for r in runs]
+    for strategy, by_case in found.items():
+        if runs := list(by_case.values()):
+            cells = [_cell(by_case.get(case.name)) for case in these]
             lines.append(f"| {strategy} | " + " | ".join(cells) + f" | {_latency(runs)} |")
     return [*lines, ""]
+
+
+def _cell(run: Found | None) -> str:
+    if run is None:
+        return ""
+    return f"{run.ate:.3f} m, {run.wrong} wrong, {run.recall:.1%}, {run.seconds:.1f} s"
 
 
 def _number(value: float, form: str) -> str:
