@@ -7,7 +7,7 @@ from importlib import import_module
 from pathlib import Path
 
 from bench.table import markdown
-from slam_backend.io.replay import versions
+from slam_backend.io.result import versions
 
 BENCHES = (
     "decode",

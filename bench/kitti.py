@@ -11,7 +11,8 @@ from bench.table import Row
 from slam_backend.core.fixes import Compared
 from slam_backend.core.measurement import SECOND, Array
 from slam_backend.io.configfile import load_config
-from slam_backend.io.replay import Result, replay
+from slam_backend.io.replay import replay
+from slam_backend.io.result import Result
 from slam_backend.lab.datasets import make_dataset
 
 CONFIG = Path(__file__).parents[1] / "config/kitti_imu_gnss.yaml"

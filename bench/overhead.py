@@ -14,7 +14,7 @@ from slam_backend.core.backend import Backend
 from slam_backend.core.config import Config, RelativeSource
 from slam_backend.io.formats import read_graph
 from slam_backend.io.formats.posegraph import measurements
-from slam_backend.io.replay import cost
+from slam_backend.io.result import cost
 
 TITLE = "Online: one update per pose"
 EXPLANATION = (

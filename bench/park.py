@@ -14,7 +14,8 @@ import numpy as np
 from bench.table import Row
 from slam_backend.core.config import Config
 from slam_backend.io.configfile import load_config
-from slam_backend.io.replay import Result, replay
+from slam_backend.io.replay import replay
+from slam_backend.io.result import Result
 from slam_backend.lab.datasets import make_dataset
 
 TITLE = "Victoria Park: the whole replay"

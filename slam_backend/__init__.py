@@ -16,7 +16,8 @@ if TYPE_CHECKING:
     from .core.errors import BadConfig, BadFile, BadMessage, MissingExtra, SlamError, SolverFailure
     from .core.trajectory import Snapshot, Trajectory
     from .io.configfile import load_config
-    from .io.replay import Result, Run, replay
+    from .io.replay import Run, replay
+    from .io.result import Result
     from .io.rundir import write_run
 
 _WHERE = {
@@ -24,7 +25,7 @@ _WHERE = {
     "BadConfig": "core.errors", "BadFile": "core.errors", "BadMessage": "core.errors",
     "MissingExtra": "core.errors", "SlamError": "core.errors", "SolverFailure": "core.errors",
     "Snapshot": "core.trajectory", "Trajectory": "core.trajectory", "load_config": "io.configfile",
-    "Result": "io.replay", "Run": "io.replay", "replay": "io.replay", "write_run": "io.rundir",
+    "Result": "io.result", "Run": "io.replay", "replay": "io.replay", "write_run": "io.rundir",
 }  # fmt: skip
 
 __all__ = [

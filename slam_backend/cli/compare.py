@@ -44,7 +44,7 @@ def command(
     Exit code 1 if a condition of --fail-if holds for any run but the base.
     """
     from ..core.errors import BadConfig
-    from ..io.rundir import FinishedRun
+    from ..io.finished import FinishedRun
     from ..lab.compare import NUMBERS, compare
     from ..lab.condition import Condition
     from ..lab.report.comparison import names, write_comparison

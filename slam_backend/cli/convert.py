@@ -36,8 +36,8 @@ def command(
 ) -> None:
     """Convert a pose graph, a trajectory or a finished run, and say what the new format cannot hold."""
     if source.is_dir():
+        from ..io.finished import FinishedRun
         from ..io.maps import export, origin_of
-        from ..io.rundir import FinishedRun
 
         done = export(FinishedRun(source), target, origin_of(origin) if origin else None)
     else:

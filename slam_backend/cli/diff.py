@@ -8,7 +8,7 @@ import typer
 
 if TYPE_CHECKING:
     from ..core.difference import Difference, Event, Shift
-    from ..io.rundir import FinishedRun
+    from ..io.finished import FinishedRun
 
 SHOWN = 10  # events, by how far they moved the newest pose
 
@@ -25,7 +25,7 @@ def command(
 
     A moment stands for all up to it and nothing later. Found by a replay of the run's inputs, which must be where they were.
     """
-    from ..io.rundir import FinishedRun
+    from ..io.finished import FinishedRun
 
     finished = FinishedRun(run)
     stamps = [_stamp(option, text, finished) for option, text in (("--from", first), ("--to", last))]

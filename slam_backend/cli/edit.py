@@ -13,10 +13,10 @@ from .progress import progress
 
 if TYPE_CHECKING:
     from ..core.command import Command
+    from ..io.finished import FinishedRun
     from ..io.history import History
     from ..io.replay import Run
     from ..io.resultbag import With
-    from ..io.rundir import FinishedRun
 
 SHOWN = 5  # ids in the line for people
 
@@ -54,7 +54,7 @@ def command(
     NAME: a factor's id (loops/1700000000.000000000/3, see decisions.jsonl), a source, or all (all but the motion).
     --source, --from and --to narrow sources and all; alone they say what to disable. All or nothing.
     """
-    from ..io.rundir import FinishedRun
+    from ..io.finished import FinishedRun
 
     lists = {"disable": disable or [], "enable": enable or [], "remove": remove or []}
     action, arguments = _asked(lists, reweight or [], (source, begin, end), (undo, redo))

@@ -40,7 +40,7 @@ def command(
     Earlier beliefs are found by a replay of the run's inputs, which must be where they were.
     """
     from ..core.query import PAST, answers
-    from ..io.rundir import FinishedRun
+    from ..io.finished import FinishedRun
 
     then = [f"{PAST}{as_of}/{name}" if as_of and not name.startswith(PAST) else name for name in names]
     told = answers(then, FinishedRun(run))

@@ -16,7 +16,8 @@ if TYPE_CHECKING:
 
     from ..core.backend import Update
     from ..io.history import History
-    from ..io.replay import Result, Run
+    from ..io.replay import Run
+    from ..io.result import Result
     from ..io.resultbag import With
 
 
@@ -172,7 +173,8 @@ def aside(job: Job) -> str:
 
 def _sweep(job: Job, sweeps: "Sequence[str]", as_json: bool) -> None:
     """All combinations, then those that ended well beside the first of them."""
-    from ..io.rundir import FinishedRun, prepare
+    from ..io.finished import FinishedRun
+    from ..io.rundir import prepare
     from ..lab.compare import compare
     from ..lab.sweep import grid, in_processes
     from .compare import as_plain, show

@@ -49,7 +49,7 @@ def command(
     as_json: Annotated[bool, typer.Option("--json", help="Every trial as JSON.")] = False,
 ) -> None:
     """Put plausible wrong loops into a recorded run and report where its map breaks."""
-    from ..io.rundir import FinishedRun
+    from ..io.finished import FinishedRun
     from ..lab.stress import NONE, Stress, configured, sentences
 
     recorded = FinishedRun(run)

@@ -30,7 +30,7 @@ def command(
 
     Its cost and the largest shift of a pose that it makes come from a replay of the run's inputs.
     """
-    from ..io.rundir import FinishedRun
+    from ..io.finished import FinishedRun
     from ..io.why import difference, life
     from .replay import watch
 

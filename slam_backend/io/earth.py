@@ -22,7 +22,7 @@ from ..core.graph import DATUM, EARTH
 from ..core.measurement import Array, format_stamp, parse_stamp
 
 if TYPE_CHECKING:
-    from .replay import Result
+    from .result import Result
 
 NAME = "fixes.csv"
 HEADER = (

@@ -9,7 +9,7 @@ from ..core.graph import Factor
 from ..core.measurement import Array
 from ..core.space import Space
 from .formats.posegraph import Edges, PoseGraph, Priors, Sightings
-from .replay import Result
+from .result import Result
 
 
 def pose_graph(result: Result) -> PoseGraph:

@@ -12,8 +12,8 @@ from ..core.errors import BadConfig, BadFile
 from ..core.geometry import inverse_of, matrix_of
 from ..core.measurement import Array, format_stamp
 from ..core.sensors.gnss import geodetic
+from .finished import FinishedRun
 from .formats import FORMATS, convert, endings
-from .rundir import FinishedRun
 
 PATH, LANDMARK = (31, 78, 156), (217, 130, 43)  # red green blue
 DECIMALS = 9  # of degrees: 0.1 mm

@@ -26,7 +26,7 @@ from .drawing import drawn_graph, landmark_cloud, newest, status_of, trajectory_
 from .encode import encode_diagnostics, encode_markers, encode_path, encode_transforms
 from .inputs import TF_STATIC, BagInputs
 from .records import Record
-from .replay import Result
+from .result import Result
 from .rundir import INPUTS, RESULT_BAG
 from .typestore import typestore_of
 from .writing import write_bag

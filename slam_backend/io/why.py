@@ -7,8 +7,8 @@ import numpy as np
 
 from ..core.errors import BadConfig
 from ..core.graph import Factor
+from .finished import FinishedRun
 from .replay import Run
-from .rundir import FinishedRun
 
 
 def life(finished: FinishedRun, name: str) -> list[Mapping[str, Any]]:

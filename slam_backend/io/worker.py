@@ -26,7 +26,8 @@ from ..core.measurement import Measurement
 from .cdr import Decoder
 from .events import is_own
 from .journal import Row
-from .replay import Result, Run
+from .replay import Run
+from .result import Result
 from .rundir import write_run
 from .typestore import typestore_of
 

@@ -10,7 +10,7 @@ from ..core.config import config_to
 from ..core.errors import BadFile
 from ..core.trajectory import Trajectory, shaped
 from ..io.configfile import flat
-from ..io.rundir import FinishedRun
+from ..io.finished import FinishedRun
 from .evaluate import How, evaluate
 
 USUAL = How()

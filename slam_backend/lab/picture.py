@@ -10,7 +10,7 @@ import numpy as np
 from ..core.graph import Decision
 from ..core.measurement import Array
 from ..core.trajectory import Trajectory
-from ..io.replay import Result
+from ..io.result import Result
 from .colours import LANDMARK, LOOP, ODOMETRY, REFUSED, SMOOTHED
 
 PICTURE = "trajectory.png"

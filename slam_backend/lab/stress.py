@@ -18,9 +18,9 @@ from ..core.errors import BadConfig, BadFile
 from ..core.measurement import parse_stamp
 from ..core.sensors.relative import RelativePose
 from ..core.trajectory import Trajectory
+from ..io.finished import FinishedRun
 from ..io.inputs import open_inputs
 from ..io.replay import Run
-from ..io.rundir import FinishedRun
 from .tally import IN, Label, Tally
 from .wrong import Injected, Wrongs, wanted
 

@@ -4,7 +4,7 @@ from ..core.errors import SlamError
 from ..core.solvers.batch import solve
 from ..core.solvers.descent import Options
 from ..core.trajectory import Trajectory
-from ..io.replay import Result
+from ..io.result import Result
 
 ENOUGH = Options(iterations=20, relative=1e-3)  # a warped map need not be warped to the last digit
 NAME = "unguarded.tum"

@@ -17,8 +17,8 @@ from ..io.feeder import Feeder
 from ..io.historian import Historian
 from ..io.inputs import OWN
 from ..io.journal import Journal
-from ..io.replay import versions
 from ..io.restore import RUN, Examination, claim, salvage, set_aside, unfinished
+from ..io.result import versions
 from .state import State
 
 Begin = Callable[["Session"], object]  # what is journaled before anything is heard

@@ -10,9 +10,9 @@ import pytest
 from slam_backend import cli
 from slam_backend.io.bags import open_bag, write_bag
 from slam_backend.io.configfile import load_config
+from slam_backend.io.finished import FinishedRun
 from slam_backend.io.records import Record
 from slam_backend.io.replay import replay
-from slam_backend.io.rundir import FinishedRun
 from slam_backend.lab.simulate import Options, simulate, write_simulation
 
 BATCH = ("--final", "batch")

@@ -19,10 +19,12 @@ from slam_backend.core.geometry import seven_of_matrix
 from slam_backend.core.graph import Factor, keyframe
 from slam_backend.core.measurement import SECOND, Array, format_stamp
 from slam_backend.io.configfile import load_config
+from slam_backend.io.finished import FinishedRun
 from slam_backend.io.formats import tum
 from slam_backend.io.linearized import write_linearized
-from slam_backend.io.replay import Result, replay
-from slam_backend.io.rundir import FILES, FinishedRun, write_run
+from slam_backend.io.replay import replay
+from slam_backend.io.result import Result
+from slam_backend.io.rundir import FILES, write_run
 
 ROOT = Path(__file__).parents[2]
 GRAPH = ROOT / "../shared/data/pgo_sesync/smallGrid3D.g2o"

@@ -7,8 +7,9 @@ import pytest
 
 from slam_backend import cli
 from slam_backend.core.config import config_from
+from slam_backend.io.finished import FinishedRun
 from slam_backend.io.replay import replay
-from slam_backend.io.rundir import FinishedRun, write_run
+from slam_backend.io.rundir import write_run
 from slam_backend.lab.stress import Stress, sentences
 
 ROUND = 50

@@ -5,7 +5,7 @@ import json
 import pytest
 
 from slam_backend import cli
-from slam_backend.io.rundir import FinishedRun
+from slam_backend.io.finished import FinishedRun
 from slam_backend.lab.simulate import Options, simulate, write_simulation
 
 

@@ -18,7 +18,8 @@ from slam_backend.core.sensors.landmark import LandmarkObservation
 from slam_backend.core.sensors.odometry import STILL, UNKNOWN, OdometryPose
 from slam_backend.core.sensors.pose import AbsolutePose
 from slam_backend.core.sensors.relative import RelativePose
-from slam_backend.io.replay import cost, settled_stream
+from slam_backend.io.replay import settled_stream
+from slam_backend.io.result import cost
 
 SIGMAS = {"sigma_translation_per_meter": 0.05, "sigma_rotation_per_meter": 0.02}
 

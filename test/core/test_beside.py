@@ -14,7 +14,8 @@ from slam_backend.core.graph import Decision
 from slam_backend.core.measurement import SECOND, frozen
 from slam_backend.core.sensors.odometry import STILL, UNKNOWN, OdometryPose
 from slam_backend.core.space import SPACES
-from slam_backend.io.replay import cost, settled_stream
+from slam_backend.io.replay import settled_stream
+from slam_backend.io.result import cost
 
 BOTH = pytest.mark.parametrize("space", ["2d", "3d"])
 OPTICAL = (0.3, 0.1, 0.5, -np.pi / 2, 0.0, -np.pi / 2)  # a camera that looks ahead: z forward, x right

@@ -13,10 +13,11 @@ from slam_backend.core.measurement import SECOND, format_stamp
 from slam_backend.core.query import answers
 from slam_backend.io.bags import open_bag, write_bag
 from slam_backend.io.configfile import load_config
+from slam_backend.io.finished import FinishedRun
 from slam_backend.io.formats import tum
 from slam_backend.io.mapfile import NAME, read_map, write_map
 from slam_backend.io.replay import replay
-from slam_backend.io.rundir import FinishedRun, write_run
+from slam_backend.io.rundir import write_run
 from slam_backend.lab.simulate import Options, simulate, write_simulation
 
 OPTIONS = Options(poses=300, loop_rate=0.3, landmarks=40)

@@ -18,10 +18,10 @@ from slam_backend.io.bags import open_bag
 from slam_backend.io.configfile import load_config
 from slam_backend.io.encode import encode_string
 from slam_backend.io.feeder import Feeder
+from slam_backend.io.finished import FinishedRun
 from slam_backend.io.inputs import OWN
 from slam_backend.io.journal import Journal
 from slam_backend.io.replay import replay
-from slam_backend.io.rundir import FinishedRun
 from slam_backend.lab.simulate import Options, simulate, write_simulation
 
 POSES = 300

@@ -10,10 +10,11 @@ import pytest
 from slam_backend.cli import main
 from slam_backend.core.errors import BadConfig
 from slam_backend.io.configfile import load_config
+from slam_backend.io.finished import FinishedRun
 from slam_backend.io.formats import read_graph, read_trajectory
 from slam_backend.io.maps import Origin, export, origin_of
 from slam_backend.io.replay import replay
-from slam_backend.io.rundir import FinishedRun, write_run
+from slam_backend.io.rundir import write_run
 from slam_backend.lab.simulate import Options, simulate, write_simulation
 
 

@@ -11,10 +11,11 @@ from slam_backend.core.query import Unknown, answers
 from slam_backend.io.bags import open_bag, write_bag
 from slam_backend.io.cdr import Decoder
 from slam_backend.io.configfile import load_config
+from slam_backend.io.finished import FinishedRun
 from slam_backend.io.inputs import open_inputs
 from slam_backend.io.past import Past
 from slam_backend.io.replay import Run, replay
-from slam_backend.io.rundir import FinishedRun, write_run
+from slam_backend.io.rundir import write_run
 from slam_backend.io.typestore import typestore_of
 from slam_backend.lab.simulate import Options, simulate, write_simulation
 

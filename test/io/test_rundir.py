@@ -11,7 +11,8 @@ from slam_backend.core.config import config_hash
 from slam_backend.core.errors import BadFile
 from slam_backend.io.configfile import load_config
 from slam_backend.io.formats import read_graph, read_trajectory
-from slam_backend.io.replay import cost, replay
+from slam_backend.io.replay import replay
+from slam_backend.io.result import cost
 from slam_backend.io.rundir import FILES, prepare, write_run
 from slam_backend.lab.simulate import Options, simulate, write_simulation
 

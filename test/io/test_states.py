@@ -11,9 +11,10 @@ from slam_backend.core.backend import Backend
 from slam_backend.core.config import config_from
 from slam_backend.core.errors import BadFile
 from slam_backend.core.query import answers
+from slam_backend.io.finished import FinishedRun
 from slam_backend.io.mapfile import read_map
 from slam_backend.io.replay import replay
-from slam_backend.io.rundir import FinishedRun, write_run
+from slam_backend.io.rundir import write_run
 from slam_backend.io.states import read_states
 from slam_backend.lab.ekf import Ekf
 from slam_backend.lab.simulate import Options, simulate, write_simulation

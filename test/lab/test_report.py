@@ -8,9 +8,10 @@ import pytest
 from slam_backend.cli import main
 from slam_backend.core.errors import BadFile
 from slam_backend.io.configfile import load_config
+from slam_backend.io.finished import FinishedRun
 from slam_backend.io.history import History, Recorded
 from slam_backend.io.replay import replay
-from slam_backend.io.rundir import FinishedRun, write_run
+from slam_backend.io.rundir import write_run
 from slam_backend.lab.report import write_report
 from slam_backend.lab.report.sparsity import _cliques
 from slam_backend.lab.report.subject import Subject

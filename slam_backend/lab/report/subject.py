@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from ...core.trajectory import Trajectory
-from ...io.rundir import FinishedRun
+from ...io.finished import FinishedRun
 
 
 class Subject(FinishedRun):

@@ -18,7 +18,7 @@ from slam_backend.core.solvers.isam2 import Isam2
 from slam_backend.core.space import SPACES
 from slam_backend.io.formats import read_graph
 from slam_backend.io.formats.posegraph import measurements
-from slam_backend.io.replay import cost
+from slam_backend.io.result import cost
 
 DATA = Path(__file__).parents[3] / "../shared/data"
 GAUGE = gtsam.noiseModel.Isotropic.Sigma(3, 1e-3)
