@@ -5,9 +5,12 @@ aside. The next one that fits shows it to be alone, and wrong. But fixes that ke
 between them, are believed against the odometry: so it must be after an outage longer than the odometry is good for. Whether they
 agree is judged as if all that had been expected of them might be off by one motion, however far: one after the other, each by its
 innovation given those before it.
+
+Where an IMU alone drives, all are believed: it is good for seconds, and with noise that is stated too small good fixes look wrong,
+are kept out, and nothing holds it any more. There a kernel of the source serves.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import gtsam
@@ -23,7 +26,6 @@ from .paths import Paths
 from .stage import Judged
 
 ASTRAY, TURNED = 1e3, 0.5  # m and rad: by how much what is expected may be off
-SPEED = 10.0  # m/s
 MOST = 100  # doubted fixes of one source that are remembered
 
 
@@ -34,7 +36,7 @@ class Doubt:
         self._sources = {n: s for n, s in config.sources.items() if isinstance(s, GnssSource)}
         self._paths, self._axes = paths, paths.space.point_dimension
         driver = config.sources.get(config.driver or "")
-        self._astray_speed = SPEED if isinstance(driver, ImuSource) else 0.0
+        self._by_imu = isinstance(driver, ImuSource)
         self._doubted: dict[str, list[Factor]] = {name: [] for name in self._sources}
 
     def admit(self, proposed: Delta, estimate: Estimate) -> Judged:
@@ -44,7 +46,7 @@ class Doubt:
             doubted, settings = self._doubted[fix.source], self._sources[fix.source]
             limit = chi2_quantile(settings.probability, self._axes)
             nis = float(self._innovations([fix], estimate)[0])
-            if not nis > limit:
+            if not nis > limit or self._by_imu:
                 decisions += [_decision(each, "refused", "alone", None, None) for each in doubted]
                 doubted.clear()
                 kept.append(fix)
@@ -97,8 +99,7 @@ class Doubt:
             return np.full(len(fixes), np.nan)
         size = len(covariance) // len(keys)
         if astray:
-            stamps = {key: fix.stamp for fix in fixes for key in fix.keys}
-            covariance = covariance + self._together({key: stamps[key] for key in keys}, estimate)
+            covariance = covariance + self._together(keys, estimate)
         jacobian = np.zeros((self._axes * len(fixes), len(covariance)))
         error = np.zeros(self._axes * len(fixes))
         for n, fix in enumerate(fixes):
@@ -114,12 +115,10 @@ class Doubt:
         white = np.linalg.solve(np.linalg.cholesky(joint), error)
         return np.asarray((white.reshape(-1, self._axes) ** 2).sum(axis=1))
 
-    def _together(self, stamps: Mapping[int, int], estimate: Estimate) -> Array:
-        """Covariance of poses, at their tangents, that may all be moved, and turned about the vertical through the first, as one; and
-        where an IMU alone drives, whose speed goes astray, left behind at a constant speed. stamps: of the keys, in their order.
-        """
+    def _together(self, keys: Sequence[int], estimate: Estimate) -> Array:
+        """Covariance of poses, at their tangents, that may all be moved, and turned about the vertical through the first, as one."""
         space = self._paths.space
-        poses = {key: estimate.pose(key) for key in stamps if is_pose(key)}
+        poses = {key: estimate.pose(key) for key in keys if is_pose(key)}
         center = next(iter(poses.values())).translation()
         middle = space.rigid(np.eye(self._axes), center)
         sigmas = np.sqrt(np.diag(space.diagonal(TURNED**2, ASTRAY**2))).copy()
@@ -127,10 +126,9 @@ class Doubt:
             sigmas[:2] = 0.0
         still = np.zeros((space.dimension,) * 2)
         rows = []
-        for key, stamp in stamps.items():
+        for key in keys:
             moved = poses[key].inverse().compose(middle).AdjointMap() if key in poses else still
-            late = (stamp - min(stamps.values())) / SECOND * self._astray_speed
-            rows.append(np.hstack([moved * sigmas, moved[:, space.translation] * late]))
+            rows.append(moved * sigmas)
         together = np.vstack(rows)
         return np.asarray(together @ together.T)
 
