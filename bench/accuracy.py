@@ -9,6 +9,7 @@ from pathlib import Path
 
 import yaml
 
+from bench.drive import drive
 from bench.fixes import away, away_by_lines, rms
 from bench.kitti import kitti
 from bench.table import Row, markdown
@@ -51,6 +52,7 @@ def husky() -> list[Row]:
 
 SETS: Mapping[str, Callable[[], list[Row]]] = {
     "husky": husky,
+    "drive_0708": drive,
     "kitti": kitti,
 }  # name -> rows; none where the data are not at hand
 

@@ -1,0 +1,79 @@
+"""What a run directory says about the earth."""
+
+import json
+
+import numpy as np
+import pytest
+
+from slam_backend.cli import main
+from slam_backend.core.errors import BadFile
+from slam_backend.core.sensors.gnss import enu
+from slam_backend.io.configfile import load_config
+from slam_backend.io.earth import NAME, read_fixes
+from slam_backend.io.maps import export
+from slam_backend.io.replay import replay
+from slam_backend.io.rundir import FinishedRun, write_run
+from slam_backend.lab.sensing import ORIGIN, on_earth
+from slam_backend.lab.simulate import Options, simulate, write_simulation
+
+DRIVE = Options(poses=200, loop_rate=0.0, landmarks=3, gnss_every=4, gnss_sigma=0.3)
+
+
+@pytest.fixture(scope="module")
+def drive(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("run")
+    made = simulate("city", 4, DRIVE)
+    written = write_simulation(made, folder / "drive.mcap")
+    settings = ("gps.withhold_every=5", f"earth.origin=[{', '.join(map(str, ORIGIN))}]")
+    result = replay(written.bag, load_config(written.config), settings).result
+    write_run(result, folder / "run")
+    return made, result, FinishedRun(folder / "run")
+
+
+def test_the_summary_says_how_the_map_lies_and_how_far_the_fixes_are(drive):
+    _, _, run = drive
+    earth = run.summary["earth"]
+    assert earth["origin"] == list(ORIGIN)
+    assert earth["fixes"] == {"told": 50, "withheld": 10}
+    assert abs(earth["yaw"] - DRIVE.gnss_yaw) < 5 * earth["sigma_yaw"] + 0.2
+    assert earth["away"]["used"]["vertical"] is None  # in the plane
+    assert earth["away"]["withheld"]["horizontal"] < 1.0
+    assert earth["nis"]["gps"]["low"] < earth["nis"]["gps"]["mean"] < earth["nis"]["gps"]["high"]
+
+
+def test_fixes_csv_holds_what_the_run_compared(drive):
+    _, result, run = drive
+    again, found = read_fixes(run.path / NAME), result.run.backend.compared(result.snapshot)
+    np.testing.assert_array_equal(again.stamps, found.stamps)
+    np.testing.assert_array_equal(again.withheld, found.withheld)
+    np.testing.assert_allclose(again.antennas, found.antennas, atol=1e-9)
+    with pytest.raises(BadFile, match="no source of kind gnss"):
+        read_fixes(run.path / "nothing.csv")
+
+
+@pytest.mark.parametrize("ending", [".geojson", ".kml"])
+def test_the_path_lies_where_the_fixes_have_shown_it(drive, tmp_path, ending):
+    made, _, run = drive
+    target = tmp_path / f"path{ending}"
+    export(run, target)
+    text = target.read_text()
+    if ending == ".kml":
+        words = text.split("<coordinates>")[1].split("</coordinates>")[0].split()
+        places = np.array([word.split(",") for word in words], dtype=float)
+        assert "clampToGround" in text
+    else:
+        places = np.array(json.loads(text)["features"][0]["geometry"]["coordinates"])
+    expected = made.sevens[:, :3] @ on_earth(DRIVE)[:3, :3].T
+    away = enu(places[:, [1, 0, 2]], ORIGIN) - expected
+    assert np.sqrt(np.mean(away[:, :2] ** 2)) < 0.3
+
+
+def test_before_the_yaw_is_known_a_run_says_so(tmp_path, capsys):
+    written = write_simulation(simulate("city", 4, Options(poses=9, gnss_every=4)), tmp_path / "short.mcap")
+    assert (
+        main(["replay", str(written.bag), "--config", str(written.config), "--out", str(tmp_path / "run")])
+        == 0
+    )
+    assert "on the earth: unknown (3 fixes): yaw not yet observable" in capsys.readouterr().out
+    assert main(["convert", str(tmp_path / "run"), str(tmp_path / "a.kml")]) == 2
+    assert "--origin LAT,LON" in capsys.readouterr().err
