@@ -79,6 +79,7 @@ class Update:
     pose: `map_T_base` of the keyframe; correction: `map_T_odom`; both x y z qx qy qz qw. origin: where the driving odometry's frame
     has been since its last restart, in that odom.
     revision: grows whenever a solver update corrects the newest pose noticeably.
+    state: where an IMU reaches it, velocity (m/s, in the map) and bias, accelerometer first; 9 numbers.
     """
 
     keyframe: Keyframe
@@ -87,6 +88,7 @@ class Update:
     revision: int
     decisions: tuple[Decision, ...]
     origin: tuple[float, ...] = HERE
+    state: tuple[float, ...] = ()
 
 
 class Backend:
@@ -700,7 +702,9 @@ class Backend:
         self._decisions = []
         self._editor.note(decisions)
         sevens = self.space.seven(pose), self.space.seven(correction)
-        return Update(b, *sevens, self._revision, decisions, self._origin)
+        state = self._state(b) if self._imu else None
+        told = () if state is None else (*state.velocity.tolist(), *state.bias.vector().tolist())
+        return Update(b, *sevens, self._revision, decisions, self._origin, told)
 
 
 def _stages(config: Config, paths: Paths, quarantine: Quarantine) -> list[Robust]:

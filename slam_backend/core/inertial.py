@@ -76,10 +76,15 @@ class Stretch:
         return 0.0 if self.start is None else (self.end.stamp - self.start.stamp) / SECOND
 
     @property
-    def motion(self) -> Motion:
-        """`start_T_end`, for who knows no velocities: with a covariance that makes up for it."""
+    def pose(self) -> Pose:
+        """`start_T_end`."""
         assert self.start is not None
-        pose = self.start.pose.between(self.end.pose)
+        return self.start.pose.between(self.end.pose)
+
+    @property
+    def motion(self) -> Motion:
+        """The same for who knows no velocities: with a covariance that makes up for it."""
+        pose = self.pose
         if self.flaw:
             acceleration, rate = UNMEASURED
             meters = acceleration * self.seconds**2 / 2 + GUESSED * self.seconds
@@ -213,9 +218,13 @@ class Inertial:
 
     def moved(self, stamp: int) -> Pose:
         """`keyframe_T_stamp`, to a stamp that is not older than what is integrated."""
-        assert self._start is not None
+        return self.since(stamp).pose
+
+    def since(self, stamp: int) -> Stretch:
+        """From the newest keyframe to such a stamp, as it is now: a keyframe may still cut it."""
         self._integrate(stamp)
-        return self._start.pose.between(self.predicted.pose)
+        assert self._measured is not None
+        return Stretch(self._start, self.predicted, self._measured, self._flaw)
 
     # -- integration -----------------------------------------------------------------------------
 

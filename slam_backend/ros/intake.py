@@ -5,7 +5,8 @@ from typing import Any, Protocol
 
 from ..core.check import checked
 from ..core.config import Config
-from ..core.measurement import SECOND
+from ..core.inertial import ImuSample
+from ..core.measurement import SECOND, StaticTransform
 from ..core.sensors.odometry import TRANSFORMS, OdometryPose
 from ..io.cdr import Decoder, header_stamp
 from ..io.inputs import TF_STATIC
@@ -17,6 +18,9 @@ from .session import Session
 
 JUMP = SECOND  # ns that the driving source must go back for its clock to have jumped
 DOUBTFUL, DOUBTFUL_BYTES = 10_000, 64 << 20  # messages at most that are kept in case its clock has jumped
+
+
+Flowing = OdometryPose | ImuSample | StaticTransform
 
 
 class Host(Protocol):
@@ -31,8 +35,8 @@ class Host(Protocol):
     def begins_anew(self, source: str) -> bool:
         """The clock of a source has jumped: whether a new session is on its way."""
 
-    def moved(self, odometry: OdometryPose) -> None:
-        """The driving odometry said something sound."""
+    def moved(self, told: Flowing) -> None:
+        """The driving odometry or the IMU said something sound, or where that is mounted."""
 
     def ignore(self, topic: str, why: str) -> None:
         """What comes on it is of no use."""
@@ -60,7 +64,12 @@ class Intake:
         drives = source is not None and source.kind == "odometry"
         self._driving = source.topic if source is not None and drives else ""
         self._early.protected = self._doubtful.protected = source.topic if source is not None else ""
-        self._decoder = Decoder(self._typestore, {self._driving: (str(driver), "odometry")} if drives else {})
+        table = {self._driving: (str(driver), "odometry")} if drives else {}
+        imus = {
+            source.topic: (name, "imu") for name, source in config.sources.items() if source.kind == "imu"
+        }
+        static = {TF_STATIC: ("", "static")} if imus else {}
+        self._decoder = Decoder(self._typestore, {**table, **imus, **static})
 
     def begin(self, session: Session) -> None:
         """What is latched comes once, and is for every session."""
@@ -87,7 +96,8 @@ class Intake:
             self._static[data] = type_
         elif self._finder is not None and not self._is_wanted(session, record, self._finder):
             return
-        odometry = self._odometry_in(record)
+        told = self._sound(record)
+        odometry = [item for item in told if isinstance(item, OdometryPose)]
         if any(self._jumps.jumped_back(item.stamp) for item in odometry) and self._host.begins_anew(
             odometry[0].source
         ):
@@ -103,7 +113,7 @@ class Intake:
         if not session.journal.append(topic, type_, data):
             self._early.put_back([(topic, type_, data)])  # the session has just ended
             return
-        for item in odometry:
+        for item in told:
             self._host.moved(item)
 
     def _is_wanted(self, session: Session, record: Record, finder: Finder) -> bool:
@@ -120,11 +130,11 @@ class Intake:
         stamp = header_stamp(self._typestore, record)
         return stamp is not None and self._jumps.goes_back(stamp)
 
-    def _odometry_in(self, record: Record) -> Sequence[OdometryPose]:
-        """What the driving source says in it, unless it cannot be right."""
+    def _sound(self, record: Record) -> Sequence[Flowing]:
+        """What the driving odometry or the IMU says in it, unless it cannot be right; where that is mounted."""
         told = self._decoder.decode(record)
         config = self._host.config
-        return [item for item in checked(told, config) if isinstance(item, OdometryPose)] if told else []
+        return [item for item in checked(told, config) if isinstance(item, Flowing)] if told else []
 
 
 class Jumps:

@@ -25,17 +25,19 @@ from rclpy.signals import SignalHandlerOptions
 from ..core.config import Config, config_from, config_to
 from ..core.errors import SlamError
 from ..core.graph import Decision
-from ..core.measurement import SECOND
+from ..core.inertial import ImuSample
+from ..core.measurement import SECOND, StaticTransform
 from ..core.sensors.odometry import OdometryPose
 from ..io.feeder import Feeder, undisturbed
 from ..io.restore import RUN, Examination
 from ..io.typestore import typestore_of
 from .diagnostics import Diagnostics
 from .inputs import Inputs
-from .intake import Intake
+from .intake import Flowing, Intake
 from .outputs import Outputs
 from .parameters import changed, config_of, declare
-from .pose import Odometer
+from .pose import Odometer, composed
+from .propagation import Propagator
 from .restoring import Restoring
 from .services import Services
 from .session import Begin, Session, empty
@@ -71,7 +73,7 @@ class BackendNode(SteadfastNode):
         self._outputs: Outputs | None = None
         self._answering: Services | None = None
         self._diagnostics: Diagnostics | None = None
-        self._odometer = Odometer(self.config)
+        self._odometer, self._propagator = Odometer(self.config), Propagator(self.config)
         self._restoring = Restoring(0, self.get_logger().info)
         self._beats: dict[str, Any] = {}
         self._count = count(1)
@@ -171,7 +173,7 @@ class BackendNode(SteadfastNode):
         if ended is not None:
             self._end(ended)
         self.state.clear()
-        self._odometer = Odometer(self.config)
+        self._odometer, self._propagator = Odometer(self.config), Propagator(self.config)
         self.session = self._opened(begin, fresh=True)
         self.get_logger().info("a new session has begun")
 
@@ -231,7 +233,7 @@ class BackendNode(SteadfastNode):
         for name in set(config.sources) - set(self.config.sources):
             self.get_logger().info(f"{config.sources[name].topic} is used as {config.sources[name].kind}")
         self.config = config
-        self._odometer = Odometer(config)
+        self._odometer, self._propagator = Odometer(config), Propagator(config)
         if self._intake is not None:
             self._intake.use(config)
         session.work(config)
@@ -293,8 +295,28 @@ class BackendNode(SteadfastNode):
         threading.Thread(target=self._renew_in_background, args=(session,), name="reset", daemon=True).start()
         return True
 
-    def moved(self, odometry: OdometryPose) -> None:
-        """The driving odometry said something sound: where the robot is in the map, at once."""
+    def moved(self, told: Flowing) -> None:
+        """The driving odometry or the IMU said something sound: where the robot is in the map, at once."""
+        if isinstance(told, StaticTransform):
+            self._propagator.mounted(told)
+        elif isinstance(told, ImuSample):
+            self._carried_on(told)
+        else:
+            self._moved(told)
+
+    def _carried_on(self, sample: ImuSample) -> None:
+        """By the IMU: its rate is that of ~/odometry."""
+        outputs, update = self._outputs, self.state.update
+        carried = self._propagator.carry(sample, update, self.state.covariance)
+        if outputs is None or update is None or carried is None:
+            return
+        outputs.odometry(sample.stamp, carried.seven, carried.covariance, twist=carried.twist)
+        if self._propagator.drives:
+            outputs.map_to_odom(sample.stamp, composed(update.correction, update.origin))
+
+    def _moved(self, odometry: OdometryPose) -> None:
+        """By the odometry; where an IMU carries on from the newest keyframe, that tells ~/odometry."""
+        self._propagator.named(odometry.child)
         outputs = self._outputs
         if outputs is None or not self._odometer.goes_on(odometry.stamp):
             return
@@ -303,14 +325,15 @@ class BackendNode(SteadfastNode):
             return
         if odometry.frame not in ("", self.config.map_frame) and self.config.odom_frame == DEFAULT_ODOM:
             outputs.odom_frame = odometry.frame
-        outputs.odometry(
-            odometry.stamp,
-            pose.seven,
-            pose.covariance,
-            odometry.child,
-            odometry.twist,
-            odometry.twist_covariance,
-        )
+        if not self._propagator.carries(odometry.stamp):
+            outputs.odometry(
+                odometry.stamp,
+                pose.seven,
+                pose.covariance,
+                odometry.child,
+                odometry.twist,
+                odometry.twist_covariance,
+            )
         outputs.map_to_odom(odometry.stamp, pose.correction)
 
     # -- the way out -----------------------------------------------------------------------------
