@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+import yaml
 
 from slam_backend.core.backend import Backend
 from slam_backend.core.config import config_from
@@ -63,3 +64,26 @@ def test_without_an_imu_nothing_is_carried(flight):
     _, samples, updates, _ = flight
     plain = config_from({"sources": ["wheels"], "wheels": {"kind": "odometry"}})
     assert Propagator(plain).carry(samples[0], updates[0], None) is None
+
+
+def test_a_node_with_nothing_but_an_imu_tells_where_it_is_at_its_rate(backend, peer, tmp_path):
+    """Over DDS; the run is that of the journal's replay."""
+    made = simulate("spiral", 5, Options(poses=40, period=0.5, imu_rate=100, loop_rate=0.0))
+    kept = ("space", "base_frame", "imu")
+    settings = {name: made.settings[name] for name in kept} | {
+        "sources": ["imu"],
+        "keyframes": {"distance": 100.0},
+    }
+    path = tmp_path / "imu.yaml"
+    path.write_text(yaml.safe_dump(settings))
+    records = [record for record in made.records if record.topic == "/imu"]
+    node = backend(path)
+    heard = peer.hear("/slam_backend/odometry", "nav_msgs/msg/Odometry")
+    poses = peer.hear("/slam_backend/pose", "geometry_msgs/msg/PoseWithCovarianceStamped")
+    peer.play(records, rate=5, extra=[(500, lambda: peer.until(lambda: poses))])
+    peer.until(lambda: len(heard) > 1000)
+    stamps = [told.header.stamp.sec * SECOND + told.header.stamp.nanosec for told in heard]
+    assert np.median(np.diff(stamps)) == SECOND // 100
+    summary = node.end()
+    assert summary["counts"]["records"] == len(records)
+    assert summary["run_hash"] == node.replayed()["run_hash"]
