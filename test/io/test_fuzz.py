@@ -139,6 +139,16 @@ def fix(n: int, stamp: int) -> bytes:
     return bytes(STORE.serialize_cdr(message, "sensor_msgs/msg/NavSatFix"))
 
 
+def inertial(n: int, stamp: int) -> bytes:
+    vector, turn = STORE.types["geometry_msgs/msg/Vector3"], STORE.types["geometry_msgs/msg/Quaternion"]
+    noise = (np.eye(3) * 1e-4).ravel()
+    message = STORE.types["sensor_msgs/msg/Imu"](
+        header(stamp, "imu"), turn(0.0, 0.0, 0.0, 1.0), noise,
+        vector(0.0, 0.0, 0.25), noise, vector(0.01 * (n % 3), 0.625, 9.81), noise,
+    )  # fmt: skip
+    return bytes(STORE.serialize_cdr(message, "sensor_msgs/msg/Imu"))
+
+
 INPUTS = {
     "wheels": Input("odometry", "nav_msgs/msg/Odometry", odometry),
     "visual": Input("odometry", "geometry_msgs/msg/PoseWithCovarianceStamped", pose_with_covariance),
@@ -150,9 +160,10 @@ INPUTS = {
     "fixes": Input("pose", "geometry_msgs/msg/PoseWithCovarianceStamped", pose_with_covariance),
     "beacons": Input("landmark", "sensor_msgs/msg/Range", echo),
     "satellites": Input("gnss", "sensor_msgs/msg/NavSatFix", fix),
+    "rates": Input("imu", "sensor_msgs/msg/Imu", inertial),
     "/tf_static": Input("static", "tf2_msgs/msg/TFMessage", mounts),
 }
-OBSERVING = ("loops", "batches", "trees", "fixes", "beacons", "satellites", "/tf_static")
+OBSERVING = ("loops", "batches", "trees", "fixes", "beacons", "satellites", "rates", "/tf_static")
 SPECIAL = [
     np.nan,
     np.inf,
@@ -255,7 +266,8 @@ def world(driver: str, space: str, noise: str, seed: int, bad: int) -> tuple[Con
     robot is, and about when.
     """
     rng = np.random.default_rng(seed)
-    names = [driver, *(name for name in OBSERVING if name != driver)]
+    unfit = ("rates",) if space == "2d" or driver == "loops" else ()  # an IMU needs 3-D, and would drive
+    names = [driver, *(name for name in OBSERVING if name not in (driver, *unfit))]
     sources = {name: {"kind": INPUTS[name].kind, "topic": name} for name in names if name != "/tf_static"}
     sources[driver] |= {"noise": noise, "max_speed": 5.0} if INPUTS[driver].kind == "odometry" else {}
     config = config_from(

@@ -53,8 +53,13 @@ def _tree(factors: Iterable[Factor], values: gtsam.Values, space: Space) -> tupl
 
     tree, rest = [], []
     for factor in sorted(factors, key=lambda factor: factor.kind not in ("gauge", "motion")):
-        whole = all(map(is_pose, factor.keys)) and factor.factor.dim() == space.dimension
-        ends = {root(key) for key in (*factor.keys, GROUND)[:2]} if whole else ()
+        poses = [key for key in factor.keys if is_pose(key)]
+        if factor.kind == "imu" and not poses:  # holds velocities and biases, on which an IMU's motion hangs
+            tree.append(factor)
+            continue
+        alone = factor.kind == "motion" or 0 < len(poses) == len(factor.keys)
+        whole = alone and factor.factor.dim() >= space.dimension
+        ends = {root(key) for key in (*poses, GROUND)[:2]} if whole else ()
         if len(ends) == 2:
             above[max(ends)] = min(ends)
             tree.append(factor)
