@@ -12,6 +12,7 @@ import yaml
 from bench.drive import drive
 from bench.fixes import away, away_by_lines, rms
 from bench.kitti import kitti
+from bench.sightings import mrclam, victoria_park_raw
 from bench.table import Row, markdown
 from slam_backend.core.config import config_from
 from slam_backend.io.replay import replay
@@ -54,6 +55,8 @@ SETS: Mapping[str, Callable[[], list[Row]]] = {
     "husky": husky,
     "drive_0708": drive,
     "kitti": kitti,
+    "mrclam": mrclam,
+    "victoria_park_raw": victoria_park_raw,
 }  # name -> rows; none where the data are not at hand
 
 
