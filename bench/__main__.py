@@ -15,6 +15,7 @@ BENCHES = (
     "park",
     "final",
     "simulated",
+    "crowd",
     "filter",
     "solve",
     "query",

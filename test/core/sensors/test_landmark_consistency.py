@@ -1,0 +1,94 @@
+"""Landmarks are as wrong as they say: Monte-Carlo over the forms that place a landmark by themselves, in both spaces."""
+
+from math import atan2, hypot
+
+import numpy as np
+import pytest
+
+from slam_backend.core.backend import Backend
+from slam_backend.core.config import config_from
+from slam_backend.core.measurement import SECOND, frozen
+from slam_backend.core.robust.chi2 import chi2_quantile
+from slam_backend.core.sensors.landmark import LandmarkObservation
+from slam_backend.core.sensors.odometry import STILL, UNKNOWN, OdometryPose
+from slam_backend.core.space import SPACES
+
+STEPS = 8
+SIGMA_TRANSLATION, SIGMA_ROTATION = 0.05, 0.02  # m, rad after 1 m
+SIGMA_POSITION, SIGMA_BEARING, SIGMA_RANGE = 0.1, 0.02, 0.15
+LANDMARKS = np.array([[4.0, 3.0, 1.0], [2.0, -4.0, -1.0], [7.0, 2.0, 0.5], [9.0, -3.0, 1.5]])
+FORMS = [(space, form) for space in ("2d", "3d") for form in ("position", "bearing_range")]
+
+
+def sighting(
+    rng: np.random.Generator, form: str, stamp: int, name: str, point: np.ndarray
+) -> LandmarkObservation:
+    """A point in the frame of the base, with the noise that its covariance states."""
+    if form == "position":
+        value, sigmas = point, np.full(3, SIGMA_POSITION)
+    else:
+        x, y, z = point
+        value = np.array([atan2(y, x), atan2(z, hypot(x, y)), np.linalg.norm(point)])
+        sigmas = np.array([SIGMA_BEARING, SIGMA_BEARING, SIGMA_RANGE])
+    noisy = value + sigmas * rng.normal(size=3)
+    return LandmarkObservation(stamp, "trees", "", name, form, frozen(noisy), frozen(np.diag(sigmas**2)))
+
+
+def nees(space_name: str, form: str, seed: int) -> float:
+    """Squared Mahalanobis distance of the last pose and the first landmark together."""
+    rng, space = np.random.default_rng(seed), SPACES[space_name]
+    wheels = {
+        "kind": "odometry",
+        "sigma_translation_per_meter": SIGMA_TRANSLATION,
+        "sigma_rotation_per_meter": SIGMA_ROTATION,
+    }
+    none = {"sigma_translation_per_radian": 0.0, "sigma_rotation_per_radian": 0.0}
+    backend = Backend(config_from({
+        "space": space_name, "keyframes": {"every": True}, "sources": ["wheels", "trees"],
+        "wheels": wheels | none, "trees": {"kind": "landmark"},
+    }))  # fmt: skip
+    points = LANDMARKS[:, : space.point_dimension] * 1.0
+    twist = np.array([1.0, 0, 0.1]) if space_name == "2d" else np.array([0.03, -0.02, 0.1, 1.0, 0, 0])
+    variances = space.diagonal(SIGMA_ROTATION**2, SIGMA_TRANSLATION**2)
+    truth = told = space.identity
+    for k in range(STEPS):
+        stamp = (k + 1) * SECOND
+        if k:
+            step = space.expmap(twist)
+            truth = truth.compose(step)
+            told = told.compose(step).compose(
+                space.expmap(rng.multivariate_normal(np.zeros(space.dimension), variances))
+            )
+        for n, point in enumerate(points):
+            seen = np.zeros(3)
+            seen[: space.point_dimension] = truth.transformTo(point)
+            backend.add(sighting(rng, form, stamp, str(n), seen))
+        backend.add(
+            OdometryPose(stamp, "wheels", "odom", "base", frozen(space.seven(told)), UNKNOWN, STILL, UNKNOWN)
+        )
+    backend.finish()
+    backend.polish()
+    keys = [backend.timeline.keyframes[-1].pose, backend.landmark("0")]
+    pose, point = backend.estimate.pose(keys[0]), backend.estimate.point(keys[1])
+    error = np.concatenate([space.logmap(pose.between(truth)), points[0] - point])
+    return float(error @ np.linalg.solve(backend.estimate.covariance(keys), error))
+
+
+def consistent(space: str, form: str, runs: int) -> None:
+    mean = np.mean([nees(space, form, seed) for seed in range(runs)])
+    dof = SPACES[space].dimension + SPACES[space].point_dimension
+    low, high = (chi2_quantile(p, dof * runs) / runs for p in (0.0005, 0.9995))
+    assert low < mean < high
+
+
+@pytest.mark.parametrize(("space", "form"), FORMS)
+def test_pose_and_landmark_are_as_wrong_as_they_say(space: str, form: str) -> None:
+    """A few runs: the mean of the squared Mahalanobis distance within its 99.9 % bounds."""
+    consistent(space, form, 12)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("space", "form"), FORMS)
+def test_pose_and_landmark_are_as_wrong_as_they_say_in_200_runs(space: str, form: str) -> None:
+    """Narrower bounds, by as many runs."""
+    consistent(space, form, 200)
