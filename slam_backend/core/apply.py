@@ -164,6 +164,9 @@ class Applier:
     def _solve(self, delta: Delta) -> bool:
         """Whether the change was applied whole; factors that cannot be solved are left out with a decision."""
         whole = True
+        held = {
+            key for id_ in delta.remove if (factor := self._solver.factors.get(id_)) for key in factor.keys
+        }
         while delta:
             try:
                 self.estimate = self._solver.update(delta)
@@ -181,6 +184,10 @@ class Applier:
             finally:
                 self._note(self._solver.incidents())
             self._book(delta)
+            for key in sorted(key for key in held if not self.estimate.knows(key)):
+                if self._parts.of(key) is not None:  # its last factor is gone
+                    self._parts.drop(key)
+                self.sighted.pop(key, None)
             return whole
         return whole
 

@@ -42,7 +42,7 @@ from .growth import Growth
 from .inertial import ImuSample, Inertial, State, Stretch, imu_of, pace_from
 from .jury import Jury
 from .keyframes import Timeline, Track, due
-from .measurement import SECOND, Array, Measurement, StaticTransform
+from .measurement import SECOND, Array, Constant, Measurement, StaticTransform
 from .mounts import Mounts
 from .parts import Parts
 from .quarantine import Quarantine
@@ -50,6 +50,7 @@ from .reunion import Reunion, reunion
 from .robust import ROBUST, Doubt, Robust
 from .robust.paths import Paths
 from .sensors import SENSORS
+from .sensors.camera import CameraModel
 from .sensors.gnss import Fix
 from .sensors.imu import bias_key, velocity_key
 from .sensors.odometry import HERE, OdometryPose, stated
@@ -134,6 +135,8 @@ class Backend:
             if isinstance(source, OdometrySource) and name != self._driver
         }
         self._epoch, self._origin = 0, HERE  # of the driving odometry
+        self._cameras: dict[str, CameraModel] = {}
+        self._memory: dict[str, Any] = {}  # of sensors, by source
         self._landmarks: dict[str, int] = {}
         self._associators = {
             name: Associator(name, source, space)
@@ -186,8 +189,11 @@ class Backend:
 
     def add(self, measurement: Measurement) -> list[Update]:
         """Take the next measurement; return an update for each keyframe that it made."""
-        if isinstance(measurement, StaticTransform):
-            self._mounts.add(measurement)
+        if isinstance(measurement, Constant):
+            if isinstance(measurement, StaticTransform):
+                self._mounts.add(measurement)
+            elif isinstance(measurement, CameraModel):
+                self._cameras[measurement.source] = measurement
             return []
         if isinstance(measurement, Command):
             return self._carry_out(measurement)
@@ -361,7 +367,10 @@ class Backend:
         newest, there = self._newest
         moved, elapsed = there.between(self.track.pose(stamp)), stamp - newest.stamp
         if elapsed > 0 and (restarted or due(self._pace, self.space, moved, elapsed)):
-            updates += self._extend(stamp)
+            at = self._waiting.image(newest.stamp, stamp)
+            updates += self._extend(at) if at is not None and self.track.covers(at) else []
+            if at is None or (at < stamp and (restarted or self.config.keyframes.every)):
+                updates += self._extend(stamp)
         return updates
 
     def _sample(self, sample: ImuSample, inertial: Inertial) -> list[Update]:
@@ -517,6 +526,9 @@ class Backend:
             DATUM in self.solver.factors,
             self._stretch,
             self._imu == self._driver,
+            kept=self.solver.factors.__contains__,
+            cameras=self._cameras,
+            memory=self._memory,
         )
 
     def _takes(self, fix: Fix) -> bool:

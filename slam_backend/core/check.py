@@ -30,6 +30,7 @@ from .measurement import SECOND, Measurement, StaticTransform
 from .sensors.gnss import Fix
 from .sensors.landmark import LandmarkObservation
 from .sensors.odometry import OdometryPose
+from .sensors.pixels import PixelFrame
 from .sensors.pose import AbsolutePose
 from .sensors.relative import RelativePose
 from .space import SPACES, Space
@@ -135,6 +136,11 @@ def _fix(item: Fix, space: Space, source: Any) -> Notes:  # noqa: ARG001
     return judge_noise(item.covariance, judge_fix(item, space))
 
 
+def _pixels(item: PixelFrame, space: Space, source: Any) -> Notes:  # noqa: ARG001  # single pixels are judged by their sensor
+    judge_stamps(item.stamp)
+    return NOTHING
+
+
 def _capped(item: Any, source: Any) -> Any:
     """With the covariance that is read cut to size."""
     name = _NOISE[source.noise] if isinstance(item, OdometryPose) else "covariance"
@@ -158,4 +164,5 @@ JUDGES: Mapping[type, Callable[[Any, Space, Any], Notes]] = {
     Fix: _fix,
     StaticTransform: _static,
     ImuSample: _imu,
+    PixelFrame: _pixels,
 }

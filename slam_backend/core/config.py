@@ -250,6 +250,11 @@ class Source(Section):
 
     topic: str = Field("", description="topic in the bag or on the network")
 
+    @property
+    def topics(self) -> tuple[str, ...]:
+        """All that belong to the source."""
+        return (self.topic,)
+
 
 class Observing(Source):
     """A source whose measurements become one factor each."""
@@ -522,8 +527,76 @@ class ImuSource(Source):
         return preset._replace(**{name: value for name, value in given.items() if value is not None})
 
 
+class Camera(Section):
+    """Of a camera whose CameraInfo is not on a topic: all four of fx, fy, cx and cy; a baseline alone goes with a topic, too."""
+
+    fx: float | None = Field(None, gt=0, le=1e6, description="focal length, pixels")
+    fy: float | None = Field(None, gt=0, le=1e6, description="focal length, pixels")
+    cx: float | None = Field(None, ge=-1e6, le=1e6, description="principal point, pixels from the left")
+    cy: float | None = Field(None, ge=-1e6, le=1e6, description="principal point, pixels from the top")
+    distortion: tuple[float, ...] = Field(
+        (),
+        max_length=8,
+        description="of raw images: k1 k2 p1 p2 k3 (plumb_bob) k4 k5 k6 (rational_polynomial); empty: none",
+    )
+    baseline: float | None = Field(
+        None, gt=0, le=1e3, description="m from the left to the right camera, where pixels are stereo"
+    )
+
+    @model_validator(mode="after")
+    def _whole(self) -> "Camera":
+        given = [name for name in ("fx", "fy", "cx", "cy") if getattr(self, name) is not None]
+        if 0 < len(given) < 4:
+            raise ValueError(f"needs all of fx, fy, cx and cy, and has only {', '.join(given)}")
+        return self
+
+
+class PixelsSource(Observing):
+    """Features tracked through the images of a camera: pixels with ids; needs space 3d. kernel: of points, not of short tracks."""
+
+    kind: Literal["pixels"] = "pixels"
+    info_topic: str = Field(
+        "",
+        description="topic of the CameraInfo; of the right camera where pixels are stereo: it has the baseline",
+    )
+    camera: Camera = Field(default_factory=Camera, description="stands above info_topic")
+    image: Literal["rectified", "raw"] = Field(
+        default="rectified",
+        description="what the pixels were found in: rectified uses P, raw K and the distortion",
+    )
+    sigma: float = Field(1.0, gt=0, le=1e3, description="pixels, where the message states none")
+    point_after: int = Field(
+        4,
+        ge=2,
+        le=1000,
+        description="sightings after which a track is a point of its own; before, a smart factor. Stereo: always from 2 on",
+    )
+    share: float = Field(
+        0.2,
+        gt=0,
+        le=10,
+        description="a point is placed when the standard deviation of its distance is below this part of it",
+    )
+    probability: float = Field(
+        0.9999,
+        gt=0,
+        le=1,
+        description="with which a true sighting is taken, if all noise is as stated; 1: all are",
+    )
+    forget: int = Field(
+        10,
+        ge=1,
+        le=10_000,
+        description="frames unseen after which a track has ended: its id is another feature then",
+    )
+
+    @property
+    def topics(self) -> tuple[str, ...]:
+        return (self.topic, self.info_topic) if self.info_topic else (self.topic,)
+
+
 AnySource = Annotated[
-    OdometrySource | RelativeSource | LandmarkSource | PoseSource | GnssSource | ImuSource,
+    OdometrySource | RelativeSource | LandmarkSource | PoseSource | GnssSource | ImuSource | PixelsSource,
     Field(discriminator="kind"),
 ]
 
@@ -618,6 +691,13 @@ class Config(Section):
             raise ValueError(f"'robust' names '{max(self.robust, key=self.robust.count)}' twice")
         if self.space == "2d" and (self.floor.z or self.floor.tilt):
             raise ValueError("'floor' needs space: 3d; in 2d nothing leaves the plane")
+        flat = [
+            name for name, source in self.sources.items() if self.space == "2d" and source.kind == "pixels"
+        ]
+        if flat:
+            raise ValueError(
+                f"source '{flat[0]}': pixels need space 3d: where a feature is seen depends on height, roll and pitch"
+            )
         if self.sources and self.driver is None:
             raise ValueError("no source drives the keyframes: add one of kind odometry, imu or relative")
         imus = [name for name, source in self.sources.items() if source.kind == "imu"]
@@ -713,7 +793,7 @@ def _one_told(first: Any, names: Sequence[str]) -> str:
     if first["type"] == "union_tag_invalid":
         what = f"there is no kind of source {first['ctx']['tag']!r}; known: {first['ctx']['expected_tags']}"
     if first["type"] == "union_tag_not_found":
-        what = "is a source, and does not say its kind: add kind: odometry, relative, landmark, pose, gnss or imu"
+        what = "is a source, and does not say its kind: add kind: odometry, relative, landmark, pose, gnss, imu or pixels"
     if first["type"] == "extra_forbidden":
         what = f"there is no such setting{_suggest(first['loc'], names)}"
     value = first.get("input")
@@ -737,6 +817,7 @@ def _suggest(location: tuple[int | str, ...], names: Sequence[str]) -> str:
             "pose": PoseSource,
             "gnss": GnssSource,
             "imu": ImuSource,
+            "pixels": PixelsSource,
         }
         known = set(kinds[path[-1]].model_fields) if path[-1] in kinds else set(kinds)
     elif path:

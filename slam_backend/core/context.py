@@ -43,6 +43,8 @@ class Context:
     gauge: key -> id of the factor that holds its component and may be replaced; None where something else holds it, or will.
     has_datum: the earth stays where it is in the map.
     stretch: what the IMU measured from the keyframe before to this one. by_imu: nothing else tells the motion.
+    kept: factor id -> whether it is in the graph. cameras: source -> what its CameraInfo says.
+    memory: by source, what its sensor keeps from one keyframe to the next; a cache of what was offered, never of what is in the graph.
     """
 
     space: Space
@@ -61,6 +63,9 @@ class Context:
     stretch: Stretch | None = None
     by_imu: bool = False
     correction: Correction = Correction()
+    kept: Callable[[str], bool] = lambda _: False
+    cameras: Mapping[str, Any] = field(default_factory=dict)
+    memory: dict[str, Any] = field(default_factory=dict)
 
     def known(self, key: int) -> bool:
         """Whether a variable is in the graph, or about to enter."""

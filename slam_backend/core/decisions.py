@@ -20,6 +20,7 @@ ABOUT_RECORDS = frozenset(
         "pose",
         "gnss",
         "imu",
+        "pixels",
         "session",
         "association",
     }

@@ -37,8 +37,13 @@ class Measurement:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class StaticTransform(Measurement):
-    """Where a sensor sits: `parent_T_child`, constant (from /tf_static)."""
+class Constant(Measurement):
+    """What holds at all times: it waits for nothing, and its stamp says nothing."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class StaticTransform(Constant):
+    """Where a sensor sits: `parent_T_child` (from /tf_static)."""
 
     parent: str
     child: str

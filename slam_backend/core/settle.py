@@ -16,7 +16,7 @@ from .firewall.clock import Clock
 from .firewall.continuity import UNBOUND, Pace
 from .firewall.rules import MOST_WAITING, decided
 from .graph import Decision
-from .measurement import SECOND, Measurement, StaticTransform
+from .measurement import SECOND, Constant, Measurement
 
 FAR = 1 << 62
 
@@ -38,7 +38,7 @@ def settled(
     """
     clock, queue = Clock(lag, pace), _Queue(driver, lag, ahead, passed)
     for item in items:
-        if isinstance(item, Decision | StaticTransform | Command):
+        if isinstance(item, Decision | Constant | Command):
             yield item
         elif item.source != driver:
             yield from queue.take(item, clock.newest)

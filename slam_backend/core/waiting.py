@@ -2,7 +2,7 @@
 
 from array import array
 from bisect import bisect_left
-from collections import Counter, defaultdict
+from collections import Counter, defaultdict, deque
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from heapq import heappop, heappush
 from itertools import islice
@@ -16,6 +16,7 @@ from .measurement import Measurement, parse_stamp
 REMEMBERED = (
     1 << 20
 )  # stamps of each source at which a measurement with the same stamp is still counted on; 12 MB
+MOST_IMAGES = 100  # images between two keyframes that are remembered as places for the next one
 
 
 class Waiting:
@@ -25,6 +26,7 @@ class Waiting:
         self._sources, self._driver = config.sources, config.driver
         self._pending: list[Offer] = []
         self._asked: list[int] = []  # stamps at which a source wants a keyframe
+        self._images: deque[int] = deque(maxlen=MOST_IMAGES)  # stamps of images
         self._undetermined: dict[int, list[Wait]] = defaultdict(list)
         self._waits = 0  # ever
         self._tallies: dict[str, _Tally] = defaultdict(_Tally)
@@ -51,6 +53,8 @@ class Waiting:
         if getattr(source, "keyframe", False):
             for stamp in measurement.ends or (measurement.stamp,):
                 heappush(self._asked, stamp)
+        elif source.kind == "pixels":
+            self._images.append(measurement.stamp)
         return [] if len(self._pending) % MOST_WAITING else self._relieved()
 
     def _relieved(self) -> list[Decision]:
@@ -69,6 +73,10 @@ class Waiting:
         while self._asked and self._asked[0] <= until:
             stamps.append(heappop(self._asked))
         return stamps
+
+    def image(self, after: int, until: int) -> int | None:
+        """The newest stamp of an image that lies after one stamp and not after another: where a keyframe is best made."""
+        return max((stamp for stamp in self._images if after < stamp <= until), default=None)
 
     def window(self, until: int) -> list[Offer]:
         """Take what lands at a keyframe with this stamp, late measurements included."""
@@ -132,7 +140,7 @@ class Waiting:
         """Ids that are taken: what is offered later gets others."""
         for id_ in ids:
             source, stamp, n = id_.split("/")
-            self._tallies[source].remember(parse_stamp(stamp), int(n))
+            self._tallies[source].remember(parse_stamp(stamp), int(n.partition(":")[0]))
 
     def leftovers(self) -> list[Decision]:
         """At the end of the input: refuse what no keyframe ever covered, and what waited in vain."""

@@ -17,11 +17,12 @@ from ..core.config import AnySource, Config
 from ..core.errors import BadConfig
 from ..core.firewall.rules import RULES, Severity, rule_of
 from ..core.graph import Decision
-from ..core.measurement import SECOND, Array, Measurement, StaticTransform
+from ..core.measurement import SECOND, Array, Constant, Measurement, StaticTransform
 from ..core.mounts import Mounts
 from ..core.sensors import SENSORS
 from ..core.sensors.landmark import LandmarkObservation
 from ..core.sensors.odometry import OdometryPose
+from ..core.sensors.pixels import PixelFrame
 from ..core.sensors.relative import RelativePose
 from ..core.space import SPACES
 from .discover import discover, is_truth
@@ -121,7 +122,11 @@ class _Watch:
     """What passes through the firewall, by source."""
 
     def __init__(self, config: Config | None) -> None:
-        self.sources = {} if config is None else {s.topic or name: name for name, s in config.sources.items()}
+        self.sources = (
+            {}
+            if config is None
+            else {t or name: name for name, s in config.sources.items() for t in s.topics}
+        )
         self.kinds = {} if config is None else {name: s.kind for name, s in config.sources.items()}
         self.driver = None if config is None else config.driver
         self.stamps: dict[str, array[int]] = defaultdict(lambda: array("q"))
@@ -142,6 +147,8 @@ class _Watch:
             self.stamps[item.source].append(item.stamp)
             if isinstance(item, StaticTransform):
                 mounts.add(item)
+            elif isinstance(item, Constant):
+                continue
             elif isinstance(item, OdometryPose) and item.source == self.driver:
                 mounts.name_base(item.child)
             else:
@@ -166,7 +173,7 @@ class _Watch:
 def _frames_of(item: Measurement) -> set[str]:
     if isinstance(item, RelativePose):
         return {item.frame_i, item.frame_j}
-    return {item.frame} if isinstance(item, LandmarkObservation) else set()
+    return {item.frame} if isinstance(item, LandmarkObservation | PixelFrame) else set()
 
 
 def _log_times(inputs: BagInputs | GraphInput) -> dict[str, "array[int]"]:
@@ -181,7 +188,11 @@ def _names(inputs: BagInputs | GraphInput, config: Config | None) -> list[tuple[
     """Topics and their types, those in use first; of a graph file, its sources."""
     if isinstance(inputs, GraphInput):
         return [(name, source.kind) for name, source in config.sources.items()] if config else []
-    used = {source.topic for source in config.sources.values()} | {TF_STATIC} if config else set()
+    used = (
+        {topic for source in config.sources.values() for topic in source.topics} | {TF_STATIC}
+        if config
+        else set()
+    )
     return sorted(
         ((name, topic.type) for name, topic in inputs.topics.items()), key=lambda t: t[0] not in used
     )

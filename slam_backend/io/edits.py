@@ -15,7 +15,7 @@ from ..core.command import Command, command, parse, text_of
 from ..core.config import Config
 from ..core.errors import BadFile, BadMessage
 from ..core.graph import Decision, identify
-from ..core.measurement import Measurement, StaticTransform
+from ..core.measurement import Constant, Measurement
 from ..core.sensors.odometry import OdometryPose
 from .formats.lines import read_text
 
@@ -97,7 +97,7 @@ def arrivals(
     counts: Counter[tuple[str, int]] = Counter()
     found = {}
     for item in settled(watched(), config):
-        if isinstance(item, Decision | StaticTransform | Command | OdometryPose):
+        if isinstance(item, Decision | Constant | Command | OdometryPose):
             continue
         name = identify(item, counts[item.source, item.stamp])
         counts[item.source, item.stamp] += 1

@@ -5,7 +5,7 @@ encapsulation header; a string is its length with the final zero, then its bytes
 covariances have 36 numbers in ROS order.
 """
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from struct import pack
 from typing import Any
@@ -117,6 +117,34 @@ def encode_imu(
     message.doubles((0, 0, 0, 1, -1, *[0] * 8), 13)  # -1: there is none
     for values, count in ((rate, 3), (rate_covariance, 9), (acceleration, 3), (acceleration_covariance, 9)):
         message.doubles(values, count)
+    return message.finish()
+
+
+def encode_camera_info(
+    stamp: int,
+    frame: str,
+    lens: tuple[float, float, float, float],
+    baseline: float = 0.0,
+    distortion: Sequence[float] = (),
+    size: tuple[int, int] = (0, 0),
+) -> bytes:
+    """sensor_msgs/msg/CameraInfo. lens: fx, fy, cx, cy, of the raw and of the rectified image; baseline: m, of a right camera;
+    distortion: of plumb_bob, or of rational_polynomial if there are more than five; size: height, width.
+    """
+    fx, fy, cx, cy = lens
+    message = _Bytes()
+    message.header(stamp, frame)
+    for side in size:
+        message.integer(side)
+    message.text("plumb_bob" if len(distortion) <= 5 else "rational_polynomial")
+    message.integer(len(distortion))
+    message.doubles(distortion, len(distortion))
+    message.doubles((fx, 0, cx, 0, fy, cy, 0, 0, 1), 9)
+    message.doubles(np.eye(3), 9)
+    message.doubles((fx, 0, cx, -fx * baseline, 0, fy, cy, 0, 0, 0, 1, 0), 12)
+    for _ in range(6):  # binning and region of interest: all of the image
+        message.integer(0)
+    message.add(b"\0")
     return message.finish()
 
 

@@ -128,22 +128,24 @@ class BagInputs(_Closing):
         """Topic -> (source, kind) of what the configuration wants, each checked against what is there."""
         topics = self.topics
         table: dict[str, tuple[str, str]] = {}
-        for name, source in config.sources.items():
-            where = ", ".join(str(path) for path in self.paths)
-            if source.topic not in topics:
-                what = f"no topic '{source.topic}' in {where}" if source.topic else "states no topic"
-                raise BadConfig(f"source '{name}': {what}{_instead(source.topic, topics)}")
-            kind, has = source.kind, topics[source.topic].type
+        where = ", ".join(str(path) for path in self.paths)
+        for name, topic in (
+            (name, topic) for name, source in config.sources.items() for topic in source.topics
+        ):
+            if topic not in topics:
+                what = f"no topic '{topic}' in {where}" if topic else "states no topic"
+                raise BadConfig(f"source '{name}': {what}{_instead(topic, topics)}")
+            kind, has = config.sources[name].kind, topics[topic].type
             if has not in SENSORS[kind].decoders:
                 takes = ", ".join(SENSORS[kind].decoders)
                 raise BadConfig(
-                    f"source '{name}': {source.topic} in {where} is {has}; a source of kind '{kind}' takes {takes}"
+                    f"source '{name}': {topic} in {where} is {has}; a source of kind '{kind}' takes {takes}"
                 )
-            if source.topic in table:
+            if topic in table:
                 raise BadConfig(
-                    f"source '{name}': topic '{source.topic}' belongs to source '{table[source.topic][0]}' already"
+                    f"source '{name}': topic '{topic}' belongs to source '{table[topic][0]}' already"
                 )
-            table[source.topic] = (name, kind)
+            table[topic] = (name, kind)
         own = {topic: row for topic, row in OWN.items() if topic in topics}
         return table | {topic: row for topic, row in own.items() if topics[topic].type in DECODERS[row[1]]}
 

@@ -15,7 +15,7 @@ from ..core.config import Config, config_from, config_to
 from ..core.decisions import DecisionLog
 from ..core.errors import BadFile, SlamError
 from ..core.graph import Decision
-from ..core.measurement import SECOND, Measurement, StaticTransform, format_stamp
+from ..core.measurement import SECOND, Constant, Measurement, format_stamp
 from ..core.sessions import SavedMap
 from ..core.settle import FAR, settled
 from ..core.solvers import SOLVERS, Solver
@@ -204,7 +204,7 @@ class Run:
                 self.decisions.add(item)
             elif isinstance(item, Command) and item.action == LOAD:
                 self._load(item)
-            elif item.stamp > until and not isinstance(item, StaticTransform):
+            elif item.stamp > until and not isinstance(item, Constant):
                 return
             elif item.stamp <= self._begins and item.source == self.config.driver:
                 self.decisions.add(_overlapping(item, self._begins))
@@ -230,7 +230,7 @@ class Run:
         before = perf_counter()
         updates = self.backend.add(item)
         self.seconds.solve(perf_counter() - before, len(updates))
-        if not isinstance(item, StaticTransform):
+        if not isinstance(item, Constant):
             self.reached = max(self.reached, item.stamp)
         yield from self._take(updates)
 

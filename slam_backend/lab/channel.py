@@ -10,10 +10,11 @@ from ..core.measurement import SECOND, Measurement
 from ..core.sensors.gnss import Fix
 from ..core.sensors.landmark import LandmarkObservation
 from ..core.sensors.odometry import OdometryPose
+from ..core.sensors.pixels import PixelFrame
 from ..core.sensors.relative import RelativePose
 from .options import Options
 
-Content = OdometryPose | RelativePose | Fix | ImuSample | tuple[LandmarkObservation, ...]
+Content = OdometryPose | RelativePose | Fix | ImuSample | PixelFrame | tuple[LandmarkObservation, ...]
 ECHO = 1_000_000  # ns from a message to its duplicate
 
 

@@ -40,7 +40,7 @@ from ..io.encode import encode_cloud, encode_odometry
 from ..io.formats import tum
 from ..io.formats.trajectory import Trajectory
 from ..io.records import Record
-from . import mrclam, pose_graphs, rtklib, victoria_raw
+from . import kitti_features, mrclam, pose_graphs, rtklib, victoria_raw
 from .gtsam_data import Content, example, lifted, planar, rows, symmetric
 from .kitti import kitti_imu_gnss
 from .matlab import read_arrays
@@ -194,6 +194,9 @@ DATASETS: Mapping[str, Dataset] = {
     ),
     "kitti_imu_gnss": Dataset(
         "a car in a town, 8 min: 46,968 samples of an IMU on /imu, 470 fixes on /fix; 3-D", kitti_imu_gnss
+    ),
+    "kitti_stereo": Dataset(
+        "a car with a stereo camera, 8 s: 77 poses on /odom, 52,544 sightings of 15,638 features on /features; 3-D", kitti_features.stereo
     ),
     "sphere2500": Dataset(
         "simulated, on a sphere: 2,500 poses, 4,949 relative poses on /edges, truth on /truth; 3-D", pose_graphs.sphere2500

@@ -10,9 +10,17 @@ FORMS: tuple[str, ...] = get_args(Form)
 POSITIVE = (
     "loop_sigma_translation", "loop_sigma_rotation", "landmark_sigma", "landmark_sigma_bearing", "range_scale",
     "gyroscope_density", "gyroscope_walk", "gyroscope_bias",
-    "accelerometer_density", "accelerometer_walk", "accelerometer_bias", "gnss_sigma",
+    "accelerometer_density", "accelerometer_walk", "accelerometer_bias", "gnss_sigma", "pixel_sigma",
 )  # fmt: skip
-_FRACTIONS = ("loop_rate", "wrong_loop_rate", "dropout", "late", "duplicated")
+_FRACTIONS = (
+    "feature_loss",
+    "wrong_feature_rate",
+    "loop_rate",
+    "wrong_loop_rate",
+    "dropout",
+    "late",
+    "duplicated",
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,6 +61,12 @@ class Options:
     gnss_arm: float = 0.5  # m: how far before, beside and above the base the antenna is
     gnss_outage_start: float = 0.0  # s after the start: there is no fix from here ...
     gnss_outage: float = 0.0  # ... for this many seconds
+    features: float = 8.0  # per m of path, where the scenario has a camera that tracks them
+    feature_range: float = 20.0  # m: how far they are seen
+    feature_loss: float = 0.02  # fraction of their sightings that are missing; what comes back has another id
+    wrong_feature_rate: float = 0.0  # fraction of their sightings that are of something else
+    pixel_sigma: float = 1.0  # pixels
+    stereo_baseline: float = 0.0  # m to the right camera; 0: there is none
     dropout: float = 0.0  # fraction of the messages that never arrive
     silence_start: float = 0.0  # s after the start: nothing that is stamped from here ...
     silence: float = 0.0  # ... for this many seconds arrives

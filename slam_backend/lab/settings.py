@@ -48,9 +48,17 @@ def _sentence(model: type[BaseModel]) -> str:
 def _table(model: type[BaseModel], skip: Collection[str] = ()) -> Iterator[str]:
     yield "| setting | default | range | what |"
     yield "|---|---|---|---|"
+    yield from _rows(model, skip)
+
+
+def _rows(model: type[BaseModel], skip: Collection[str] = (), within: str = "") -> Iterator[str]:
     for name, field in model.model_fields.items():
-        if name not in skip:
-            yield f"| `{name}` | {_default(field)} | {_range(field)} | {field.description or ''} |"
+        if name in skip:
+            continue
+        if below := _section(field):
+            yield from _rows(below, within=f"{within}{name}.")
+        else:
+            yield f"| `{within}{name}` | {_default(field)} | {_range(field)} | {field.description or ''} |"
 
 
 def _default(field: FieldInfo) -> str:

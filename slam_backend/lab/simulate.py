@@ -19,13 +19,14 @@ from ..core.inertial import ImuSample
 from ..core.measurement import SECOND, Array, Measurement, format_stamp, frozen
 from ..core.sensors.gnss import Fix
 from ..core.sensors.odometry import STILL, UNKNOWN, OdometryPose
+from ..core.sensors.pixels import PixelFrame
 from ..core.sensors.relative import RelativePose
 from ..io.bags import write_bag
 from ..io.encode import encode_cloud, encode_fix, encode_imu, encode_odometry, encode_transforms
 from ..io.formats import tum
 from ..io.formats.trajectory import Trajectory
 from ..io.records import Record
-from . import sensing
+from . import features, sensing
 from .channel import Sent, delivered, in_order
 from .inertia import imu_messages
 from .options import Options
@@ -44,6 +45,7 @@ LATENCY = {
     "/landmarks": 50_000_000,
     "/imu": 0,
     "/fix": 80_000_000,
+    "/features": 40_000_000,
 }  # ns
 TOLD = {  # fields of a cloud, by what is told of a landmark
     "position": ("x", "y", "z"), "bearing_range": ("azimuth", "elevation", "range"),
@@ -75,9 +77,11 @@ class Simulation:
     @property
     def records(self) -> Iterator[Record]:
         """What the bag holds, log times strictly increasing; /tf_static first where there is a camera."""
-        camera = SCENARIOS[self.scenario].camera
-        if camera is not None:
-            mounts = {sensing.CAMERA: seven_of_matrix(_mounted(camera))}
+        mounts = {
+            frame: seven_of_matrix(_mounted(each))
+            for frame, each in _cameras(SCENARIOS[self.scenario]).items()
+        }
+        if mounts:
             data = encode_transforms(START, sensing.BASE, mounts)
             yield Record("/tf_static", "tf2_msgs/msg/TFMessage", START - SECOND // 1000, data)
         yield from map(_record, self.sent)
@@ -94,7 +98,7 @@ def simulate(scenario: str, seed: int = 0, options: Options = Options()) -> Simu
         raise BadConfig(f"there is no scenario '{scenario}'; known: {', '.join(SCENARIOS)}")
     world = SCENARIOS[scenario]
     # One stream for each cause of chance: a change of the loops leaves the odometry as it was.
-    *chances, for_channel, for_imu, for_gnss = np.random.default_rng(seed).spawn(9)
+    *chances, for_channel, for_imu, for_gnss, for_images = np.random.default_rng(seed).spawn(10)
     truth = chain(exp_of(world.path(options.poses, chances[0])))
     count = world.landmarks if options.landmarks is None else options.landmarks
     landmarks = world.place(truth, count, chances[1])
@@ -108,6 +112,7 @@ def simulate(scenario: str, seed: int = 0, options: Options = Options()) -> Simu
         messages = chain_of(
             messages, (_sent("/fix", fix) for fix in sensing.fixes(truth, stamps, options, for_gnss))
         )
+    messages = chain_of(messages, _images(world, truth, stamps, options, for_images))
     lost: Counter[str] = Counter()
 
     def counted(what: str) -> None:
@@ -137,7 +142,23 @@ def _messages(
         yield Sent(seen[0].stamp + LATENCY["/landmarks"], "/landmarks", seen)
 
 
-def _sent(topic: str, item: OdometryPose | RelativePose | ImuSample | Fix) -> Sent:
+def _images(
+    world: Scenario, truth: Array, stamps: list[int], options: Options, rng: np.random.Generator
+) -> Iterator[Sent]:
+    if world.eye is not None:
+        path = float(np.linalg.norm(np.diff(truth[:, :3, 3], axis=0), axis=1).sum())
+        points = features.around(truth, round(options.features * path), rng)
+        for frame in features.frames(truth, points, _mounted(world.eye), stamps, options, rng):
+            yield _sent("/features", frame)
+
+
+def _cameras(world: Scenario) -> dict[str, tuple[float, ...]]:
+    """Frame -> where it is in the base."""
+    named = {sensing.CAMERA: world.camera, features.EYE: world.eye}
+    return {frame: six for frame, six in named.items() if six is not None}
+
+
+def _sent(topic: str, item: OdometryPose | RelativePose | ImuSample | Fix | PixelFrame) -> Sent:
     return Sent(item.stamp + LATENCY[topic], topic, item)
 
 
@@ -168,6 +189,15 @@ def _record(sent: Sent) -> Record:
         return Record(
             sent.topic, FIX, sent.arrival, encode_fix(item.stamp, item.frame, item.place, item.covariance)
         )
+    if isinstance(item, PixelFrame):
+        columns = {
+            "id": item.ids.astype(np.uint32),
+            "u": item.pixels[:, 0],
+            "v": item.pixels[:, 1],
+            "sigma": item.sigmas,
+        }
+        columns |= {} if np.isnan(item.pixels[:, 2]).all() else {"ur": item.pixels[:, 2]}
+        return Record(sent.topic, CLOUD, sent.arrival, encode_cloud(item.stamp, item.frame, columns))
     if isinstance(item, OdometryPose):
         frames, noise = (item.frame, item.child), (item.covariance, item.twist, item.twist_covariance)
     else:
@@ -201,10 +231,16 @@ def _settings(world: Scenario, options: Options, topics: set[str]) -> dict[str, 
             for what in ("density", "walk")
         }
         | {f"sigma_{part}_bias": getattr(options, f"{part}_bias") for part in PARTS},
+        "features": {
+            "kind": "pixels",
+            "topic": "/features",
+            "sigma": options.pixel_sigma,
+            "camera": _lens(options),
+        },
     }
     sources["gps"] = {"kind": "gnss", "topic": "/fix"}
     present = {name: source for name, source in sources.items() if source["topic"] in topics}
-    mounts = {} if world.camera is None else {sensing.CAMERA: list(world.camera)}
+    mounts = {frame: list(six) for frame, six in _cameras(world).items()}
     if "/fix" in topics:
         mounts[sensing.ANTENNA] = [*sensing.arm_of(options).tolist(), 0.0, 0.0, 0.0]
     extrinsics = {"extrinsics": mounts} if mounts else {}
@@ -213,6 +249,11 @@ def _settings(world: Scenario, options: Options, topics: set[str]) -> dict[str, 
     settings = {**head, **extrinsics, "sources": list(present), **present}
     config_from(settings)  # options that no configuration can say are refused here, not at the replay
     return settings
+
+
+def _lens(options: Options) -> dict[str, float]:
+    lens = features.lens_of(options)._asdict()
+    return lens if options.stereo_baseline else {name: lens[name] for name in ("fx", "fy", "cx", "cy")}
 
 
 class Written(NamedTuple):

@@ -34,6 +34,7 @@ class Scenario:
     place: Callable[[Array, int, Generator], Array]
     landmarks: int = 0
     camera: Extrinsics | None = None  # None: landmarks are seen all around, from the base
+    eye: Extrinsics | None = None  # of a camera that tracks features, its z ahead; None: there is none
 
 
 def exp_of(tangents: Array) -> Array:
@@ -163,6 +164,10 @@ SCENARIOS: Mapping[str, Scenario] = {
     ),
     "spiral": Scenario(
         "a helix in 3-D, 20 m across, rising 1 m a turn; loops to the turn below", "3d", _spiral, _scattered
+    ),
+    "flight": Scenario(
+        "the same helix, past features that a camera tracks which looks ahead", "3d", _spiral, _scattered,
+        eye=(0.1, 0.0, 0.0, -np.pi / 2, 0.0, -np.pi / 2),
     ),
     "lawnmower": Scenario(
         "lanes of 40 m, 4 m apart, among 200 landmarks; no loops", "2d", _planar(_lawnmower), _scattered, 200

@@ -89,7 +89,7 @@ class Finder:
 
 
 def _is_source(topic: str, config: Config) -> bool:
-    return any(source.topic == topic for source in config.sources.values())
+    return any(topic in source.topics for source in config.sources.values())
 
 
 def _has_odometry(config: Config) -> bool:

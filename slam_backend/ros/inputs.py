@@ -97,7 +97,7 @@ class Inputs:
 
     def _wanted(self, config: Config) -> dict[str, str]:
         """Topics that are on the graph and can be read: topic -> type."""
-        kinds = {source.topic: source.kind for source in config.sources.values()}
+        kinds = {topic: source.kind for source in config.sources.values() for topic in source.topics}
         there = dict(self._node.get_topic_names_and_types())
         home = str(self._node.get_namespace()).rstrip("/") + "/"
         foreign = tuple(topic.removesuffix(MARK[1:]) for topic in there if topic.endswith(MARK))

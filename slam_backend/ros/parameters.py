@@ -94,7 +94,8 @@ def settings(config: Config) -> dict[str, tuple[Any, FieldInfo | None]]:
         found.update(_leaves(name, data[name], field))
     for name in data["sources"]:
         fields = models[data[name]["kind"]].model_fields
-        found |= {f"{name}.{key}": (value, fields[key]) for key, value in data[name].items()}
+        for key, value in data[name].items():
+            found.update(_leaves(f"{name}.{key}", value, fields[key]))
     return found | {f"extrinsics.{frame}": (list(six), None) for frame, six in data["extrinsics"].items()}
 
 

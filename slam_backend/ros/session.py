@@ -79,7 +79,9 @@ class Session:
 
     def work(self, config: Config) -> None:
         """A worker for these sources; one that runs already is replaced, and the new one reads the journal from its start."""
-        table = dict(OWN) | {source.topic: (name, source.kind) for name, source in config.sources.items()}
+        table = dict(OWN) | {
+            topic: (name, source.kind) for name, source in config.sources.items() for topic in source.topics
+        }
         with self._lock:
             if self._ended:
                 return
@@ -89,8 +91,9 @@ class Session:
                 self.feeder.close()
             self.journal.announce(
                 {
-                    source.topic: next(iter(SENSORS[source.kind].decoders))
+                    topic: type_
                     for source in config.sources.values()
+                    for topic, type_ in zip(source.topics, SENSORS[source.kind].decoders, strict=False)
                 }
             )
             if self.historian is not None:

@@ -194,6 +194,12 @@ RULES: Mapping[str, Rule] = {
     "check/landmark_kind": Rule(
         "error", "there is no landmark of this kind", "send position, bearing and range, or bearing: see docs/messages.md"
     ),
+    "*/no_camera": Rule(
+        "error", "no calibration of the camera", "set 'camera' of the source, or 'info_topic' to that of its CameraInfo",
+    ),
+    "*/off_keyframe": Rule(
+        "note", "an image between two keyframes", "nothing; 'keyframe: true' makes a keyframe at each image",
+    ),
     # -- amounts -------------------------------------------------------------------------------------------------
     "settle/flood": Rule(
         "error", "more wait for the driving source than memory should hold; the oldest are dropped",

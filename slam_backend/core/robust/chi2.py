@@ -1,7 +1,10 @@
 """Chi-square: how large a squared Mahalanobis distance may be by chance."""
 
 from functools import cache
-from math import erf, exp, lgamma, log, sqrt
+from math import erf, exp, inf, lgamma, log, sqrt
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
 
 def chi2_below(value: float, dof: int) -> float:
@@ -24,3 +27,13 @@ def chi2_quantile(probability: float, dof: int) -> float:
         middle = (low + high) / 2
         low, high = (middle, high) if chi2_below(middle, dof) < probability else (low, middle)
     return high
+
+
+def chi2_limits(probability: float, dofs: ArrayLike) -> NDArray[np.float64]:
+    """`chi2_quantile` of each; infinite for a probability of 1."""
+    each = np.asarray(dofs).astype(int)
+    found = np.full(each.shape, inf)
+    if probability < 1:
+        for dof in np.unique(each):
+            found[each == dof] = chi2_quantile(probability, int(dof)) if dof > 0 else 0.0
+    return found

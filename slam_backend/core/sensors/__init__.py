@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 from ..context import Context
 from ..graph import Delta, Keyframe, Offer
 from ..measurement import Decoder
-from . import gnss, imu, landmark, odometry, pose, relative, static
+from . import gnss, imu, landmark, odometry, pixels, pose, relative, static
 
 
 class Sensor(NamedTuple):
@@ -27,5 +27,6 @@ SENSORS: Mapping[str, Sensor] = {
     "gnss": Sensor(gnss.DECODERS, gnss.factors),
     "pose": Sensor(pose.DECODERS, pose.factors),
     "imu": Sensor(imu.DECODERS, imu.factors),
+    "pixels": Sensor(pixels.DECODERS, pixels.factors),
     "static": Sensor(static.DECODERS, static.factors),
 }

@@ -12,6 +12,7 @@ Cholesky is about twice as fast as QR on graphs rich in loops, but throws on lon
 strongly anisotropic information; once it has thrown for no single factor's fault, QR serves for the rest of the run.
 """
 
+from collections import deque
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from math import isfinite
@@ -108,10 +109,11 @@ class Isam2:
     def _apply(self, delta: Delta) -> None:
         graph, values = _graph(delta.add), _values(delta.values)
         first = self._isam.getFactorsUnsafe().size()
-        if delta.remove:
-            self._isam.update(graph, values, [self._slots[id_] for id_ in delta.remove])
-        else:
-            self._isam.update(graph, values)
+        params = gtsam.ISAM2UpdateParams()
+        params.removeFactorIndices = [self._slots[id_] for id_ in delta.remove]
+        # a pixel is less linear than all else: what is off its point of linearization now is an outlier at the next frame
+        params.force_relinearize = any(factor.kind == "pixel" for factor in delta.add)
+        self._isam.update(graph, values, params)
         for i, factor in enumerate(delta.add):
             self._slots[factor.id] = first + i
         if any(factor.kind in JOINING for factor in delta.add):
@@ -128,12 +130,23 @@ class Isam2:
                 raise RuntimeError(
                     f"estimate is not finite, or leaves the world, near variable {gtsam.DefaultKeyFormatter(key)}"
                 )
-        _check_held(self._isam, (key for id_ in _gone(delta) for key in self.factors[id_].keys))
+        _check_held(self._isam, self._released(delta))
+
+    def _released(self, delta: Delta) -> set[int]:
+        """What removed factors held, and others must hold now.
+
+        Not asked of pixels: hundreds of others hold such a pose, and a point that loses all of its sightings goes with them.
+        """
+        gone = [self.factors[id_] for id_ in _gone(delta)]
+        return {key for factor in gone if factor.kind != "pixel" for key in factor.keys}
 
     def _commit(self, delta: Delta) -> None:
         for id_ in _gone(delta):
-            self.factors.pop(id_, None)
             self._slots.pop(id_, None)
+            gone = self.factors.pop(id_, None)
+            for key in gone.keys if gone else ():
+                if not self._isam.valueExists(key):
+                    self._guesses.pop(key, None)
         for factor in delta.add:
             self.factors[factor.id] = factor
         self._guesses.update(delta.values)
@@ -155,7 +168,7 @@ class Isam2:
             self._qr = qr or self._config.factorization == "auto"
             try:
                 self._isam, self._slots = self._climb(list(self._after(delta)), values)
-                _check_held(self._isam, (key for id_ in _gone(delta) for key in self.factors[id_].keys))
+                _check_held(self._isam, self._released(delta))
             except _Failures:
                 guilty = self._unsolvable(delta, before)
             else:
@@ -252,17 +265,23 @@ class Isam2:
     def _unsolvable(self, delta: Delta, before: gtsam.Values) -> tuple[str, ...]:
         """Factors of the change that cannot be solved one after the other, motion first."""
         kept, values, guilty = list(self.factors.values()), gtsam.Values(before), []
-        for factor in sorted(delta.add, key=lambda factor: factor.kind not in ("gauge", "motion")):
+        sure = [[factor] for factor in delta.add if factor.kind in ("gauge", "motion")]
+        groups = deque([*sure, [factor for factor in delta.add if factor.kind not in ("gauge", "motion")]])
+        while groups:  # halves of what fails: a camera adds hundreds at once
+            group = groups.popleft()
             trial = gtsam.Values(values)
-            for key in factor.keys:
+            for key in (key for factor in group for key in factor.keys):
                 if not trial.exists(key) and key in delta.values:
                     trial.insert(key, delta.values[key])
             try:
-                self._settled([*kept, factor], trial)
+                self._settled([*kept, *group], trial)
             except _Failures:
-                guilty.append(factor.id)
+                if len(group) == 1:
+                    guilty.append(group[0].id)
+                else:
+                    groups.extendleft((group[len(group) // 2 :], group[: len(group) // 2]))
             else:
-                kept.append(factor)
+                kept += group
                 values = trial
         return tuple(guilty) or tuple(factor.id for factor in delta.add)
 

@@ -29,7 +29,9 @@ def named() -> set[str]:
     }
     found |= {f"doubt/{reason}" for reason in re.findall(r'"(unexpected|alone)"', SOURCE)}
     found |= {f"decode/{reason}" for reason in re.findall(r'"(bad_message|unknown_type|oversize)"', SOURCE)}
-    return found | {f"*/{reason}" for reason in re.findall(r'"(unknown_frame|uncovered)"', SOURCE)}
+    return found | {
+        f"*/{reason}" for reason in re.findall(r'"(unknown_frame|uncovered|no_camera|off_keyframe)"', SOURCE)
+    }
 
 
 def test_the_table_and_the_code_name_the_same_rules() -> None:

@@ -1,0 +1,85 @@
+"""Pixels as gtsam's own factors: of a pose and a point, and smart ones, of poses alone."""
+
+from collections.abc import Sequence
+from functools import cache
+from math import isnan
+from typing import Any
+
+import gtsam
+import numpy as np
+
+from ..config import PixelsSource
+from ..graph import Factor
+from ..robust.kernels import with_kernel
+from .frames import Frame, Sighting
+from .triangulation import Lens
+
+# A point behind its camera gives a constant error and no gradient instead of an exception; the tracker removes it.
+SILENT = (False, False)
+RANK = 1e-3  # least singular value of a smart factor's triangulation
+
+
+class Reprojection:
+    """kind of all its factors: pixel. An id is that of the frame and the number of the feature: `<source>/<stamp>/<n>:<feature>`."""
+
+    def __init__(self, config: PixelsSource) -> None:
+        self._noise = cache(
+            lambda sigma, rows: with_kernel(gtsam.noiseModel.Isotropic.Sigma(rows, sigma), config)
+        )
+        self._smart = _smart_parameters()
+
+    def of_point(self, number: int, sighting: Sighting, key: int) -> Factor:
+        """A feature that is seen where the point is."""
+        frame, row = sighting
+        u, v, right = frame.pixels[row].tolist()
+        mono = isnan(right)
+        noise = self._noise(float(frame.sigmas[row]), 2 if mono else 3)
+        mount = () if frame.mount.equals(_HERE, 0.0) else (frame.mount,)
+        made: Any = (
+            gtsam.GenericProjectionFactorCal3_S2(
+                np.array((u, v)), noise, frame.key, key, _mono(frame.lens), *SILENT, *mount
+            )
+            if mono
+            else gtsam.GenericStereoFactor3D(
+                gtsam.StereoPoint2(u, right, v), noise, frame.key, key, _stereo(frame.lens), *SILENT, *mount
+            )
+        )
+        return Factor(id_of(number, frame), "pixel", made, (frame.key, key), frame.stamp)
+
+    def smart(self, number: int, sightings: Sequence[Sighting]) -> Factor:
+        """One factor for all sightings, the point eliminated. gtsam takes one noise for all: their root mean square."""
+        frame = sightings[-1][0]
+        sigma = float(np.sqrt(np.mean([each.sigmas[row] ** 2 for each, row in sightings])))
+        noise = gtsam.noiseModel.Isotropic.Sigma(2, sigma)
+        made = gtsam.SmartProjectionPoseFactorCal3_S2(noise, _mono(frame.lens), frame.mount, self._smart)
+        for each, row in sightings:
+            made.add(each.pixels[row, :2], each.key)
+        keys = tuple(each.key for each, _ in sightings)
+        return Factor(f"{id_of(number, frame)}:smart", "pixel", made, keys, frame.stamp)
+
+
+_HERE = gtsam.Pose3()
+
+
+def id_of(number: int, frame: Frame) -> str:
+    """Of the factor that a sighting makes, and of what is decided about it."""
+    return f"{frame.id}:{number}"
+
+
+def _smart_parameters() -> gtsam.SmartProjectionParams:
+    """Its point is sought anew at each linearization, so that the result does not depend on who looked before."""
+    params = gtsam.SmartProjectionParams(
+        gtsam.LinearizationMode.HESSIAN, gtsam.DegeneracyMode.ZERO_ON_DEGENERACY, *SILENT, 0.0
+    )
+    params.setRankTolerance(RANK)
+    return params
+
+
+@cache
+def _mono(lens: Lens) -> gtsam.Cal3_S2:
+    return gtsam.Cal3_S2(lens.fx, lens.fy, 0.0, lens.cx, lens.cy)
+
+
+@cache
+def _stereo(lens: Lens) -> gtsam.Cal3_S2Stereo:
+    return gtsam.Cal3_S2Stereo(lens.fx, lens.fy, 0.0, lens.cx, lens.cy, lens.baseline)
