@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from .config import OdometrySource
-from .context import Context
+from .context import Context, unknown_frame
 from .graph import Decision, Factor, Keyframe, Motion, Offer, Pose, identify
 from .keyframes import Placed, Track
 from .measurement import SECOND, Array, format_stamp
@@ -54,8 +54,8 @@ class Beside:
         if last is None or last.number != item.epoch:
             mount = self._mounts.whole(item.child.lstrip("/"))
             if mount is None:
-                detail = f"where is '{item.child}' on the robot? add it to 'extrinsics' or send /tf_static"
-                yield refusal(Offer(identify(item, 0), item), "odometry", "unknown_frame", detail)
+                why = unknown_frame(item.child)
+                yield refusal(Offer(identify(item, 0), item), "odometry", why.reason, why.detail)
                 return
             next_ = last.next if last else 0
             self._epochs.append(_Epoch(self._space, self._settings, mount, item, next_))

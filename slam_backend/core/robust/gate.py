@@ -13,11 +13,11 @@ from math import isfinite
 from typing import Any
 
 from ..config import Config
-from ..graph import Decision, Delta, Estimate, Factor, Verdict
+from ..graph import Decision, Delta, Estimate, Factor
 from .accord import Accord, Ruler, told
 from .held import Held
 from .paths import Path, Paths
-from .stage import Judged
+from .stage import Judged, judged
 
 TRIALS = 8  # ways that a search for the smallest set of contradicting loops may look at
 STIRRED = 6  # nearest refused loops that are judged anew where something has changed
@@ -93,8 +93,8 @@ class Gate:
         self._given_up.add(worst)
         words = f"{len(against)} accepted loops around it contradict it, and {len(agree)} agree"
         basis = {"against": against, "agree": agree}
-        return _decision(
-            loop, "removed", "contradicted", words, len(against), OUTVOTE * (len(agree) + 1), basis
+        return judged(
+            "gate", loop, "removed", "contradicted", words, len(against), OUTVOTE * (len(agree) + 1), **basis
         )
 
     def _votes(self, loop: Factor) -> tuple[list[str], list[str]]:
@@ -127,7 +127,7 @@ class Gate:
     def _refusal(self, loop: Factor, found: Accord, path: Path, culprits: frozenset[str] | None) -> Decision:
         if not isfinite(found.statistic):
             words = "its numbers are too large or too small to be compared with anything"
-            return _decision(loop, "refused", "incomparable", words, None, None, {})
+            return judged("gate", loop, "refused", "incomparable", words, None, None)
         noise, drift = self._ruler.remedy(self._paths.path_of(loop), path)
         remedy, words = told(noise, drift, self._drift)
         basis = {**_basis(found, path), "would_pass": remedy}
@@ -139,8 +139,8 @@ class Gate:
             reason, statistic, threshold = "drift", found.away[0], found.bound[0]
             if statistic <= threshold:
                 statistic, threshold = found.away[1], found.bound[1]
-        return _decision(
-            loop, "refused", reason, f"{_where(found, path)}; {words}", statistic, threshold, basis
+        return judged(
+            "gate", loop, "refused", reason, f"{_where(found, path)}; {words}", statistic, threshold, **basis
         )
 
     def _smallest(self, loop: Factor, path: Path) -> frozenset[str] | None:
@@ -241,12 +241,14 @@ def _basis(found: Accord, path: Path) -> dict[str, Any]:
 
 def _passed(loop: Factor, found: Accord, path: Path) -> Decision:
     words = _where(found, path)
-    return _decision(loop, "accepted", "passes", words, found.statistic, found.threshold, _basis(found, path))
+    return judged(
+        "gate", loop, "accepted", "passes", words, found.statistic, found.threshold, **_basis(found, path)
+    )
 
 
 def _unconnected(loop: Factor) -> Decision:
     words = "neither odometry nor loops connect its ends: there is nothing that it could contradict"
-    return _decision(loop, "accepted", "unconnected", words, None, None, {})
+    return judged("gate", loop, "accepted", "unconnected", words, None, None)
 
 
 def _outvoted(losers: Iterable[Factor], winners: tuple[Factor, ...]) -> Iterable[Decision]:
@@ -254,15 +256,15 @@ def _outvoted(losers: Iterable[Factor], winners: tuple[Factor, ...]) -> Iterable
     ids = sorted(each.id for each in winners)
     words = f"{len(ids)} loops agree with each other and would pass but for {len(losers)} with this one: {_listed(ids)}"
     for loop in losers:
-        yield _decision(loop, "removed", "outvoted", words, len(ids), OUTVOTE * len(losers), {"by": ids})
+        yield judged("gate", loop, "removed", "outvoted", words, len(ids), OUTVOTE * len(losers), by=ids)
 
 
 def _winning(winners: tuple[Factor, ...], losers: tuple[Factor, ...]) -> Iterable[Decision]:
     ids = sorted(each.id for each in losers)
     for loop in winners:
         words = f"with {len(winners) - 1} others it outvotes {_listed(ids)}"
-        yield _decision(
-            loop, "accepted", "outvotes", words, len(winners), OUTVOTE * len(losers), {"removed": ids}
+        yield judged(
+            "gate", loop, "accepted", "outvotes", words, len(winners), OUTVOTE * len(losers), removed=ids
         )
 
 
@@ -270,18 +272,3 @@ def _listed(ids: Iterable[str]) -> str:
     """The first few."""
     ids = sorted(ids)
     return ", ".join(ids[:3]) + (f" and {len(ids) - 3} more" if len(ids) > 3 else "")
-
-
-def _decision(
-    loop: Factor,
-    verdict: Verdict,
-    reason: str,
-    detail: str,
-    statistic: float | None,
-    threshold: float | None,
-    basis: dict[str, Any],
-) -> Decision:
-    return Decision(
-        loop.stamp, loop.id, loop.source, verdict, "gate", reason, detail, statistic, threshold,
-        loop.stamps, basis=basis,
-    )  # fmt: skip

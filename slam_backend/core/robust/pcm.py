@@ -18,7 +18,7 @@ from ..measurement import Array
 from .chi2 import chi2_quantile
 from .clique import LargestClique
 from .paths import Path, Paths
-from .stage import Judged
+from .stage import Judged, judged
 
 NAMED = 20  # loops that a verdict names
 AXES = {
@@ -46,7 +46,9 @@ class Pcm:
             distances = self._cycles.add(loop)
             if distances is None:
                 decisions.append(
-                    _decision(loop, "refused", "unconnected", "no odometry reaches both its ends", None, None)
+                    judged(
+                        "pcm", loop, "refused", "unconnected", "no odometry reaches both its ends", None, None
+                    )
                 )
                 continue
             agree = np.flatnonzero(distances <= self._threshold).tolist()
@@ -78,10 +80,10 @@ class Pcm:
             agrees += f"; {self._config.smallest} are needed"
         more: dict[str, object] = {} if self._clique.exact else {"exact": False}
         if verdict in ("accepted", "restored"):
-            return _decision(self._loops[n], verdict, "clique", agrees, with_it, others, **more)
+            return judged("pcm", self._loops[n], verdict, "clique", agrees, with_it, others, **more)
         if with_it < others:
             more["absent"] = self._absent(n)
-        return _decision(self._loops[n], verdict, "outside_clique", agrees, with_it, others, **more)
+        return judged("pcm", self._loops[n], verdict, "outside_clique", agrees, with_it, others, **more)
 
     def _absent(self, n: int) -> list[str]:
         """The smallest set of the members without which it agrees with all others of them; some, where they are many."""
@@ -183,17 +185,3 @@ class Cycles:
         whole[:, :3, :3] = whole[:, 3:, 3:] = rotation
         whole[:, 3:, :3] = cross @ rotation
         return np.asarray(whole[:, self._axes][:, :, self._axes])
-
-
-def _decision(
-    loop: Factor,
-    verdict: Verdict,
-    reason: str,
-    detail: str,
-    statistic: float | None,
-    threshold: float | None,
-    **basis: object,
-) -> Decision:
-    return Decision(
-        loop.stamp, loop.id, loop.source, verdict, "pcm", reason, detail, statistic, threshold, loop.stamps, basis=basis
-    )  # fmt: skip

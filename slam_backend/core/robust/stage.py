@@ -1,8 +1,8 @@
 """What a robust stage is."""
 
-from typing import Protocol
+from typing import Any, Protocol
 
-from ..graph import Decision, Delta, Estimate
+from ..graph import Decision, Delta, Estimate, Factor, Verdict
 
 Judged = tuple[Delta, tuple[Decision, ...]]
 
@@ -23,3 +23,20 @@ class Robust(Protocol):
         What it removes is decided here; what it adds is decided once the other stages have judged it, and the solver taken it.
         """
         ...
+
+
+def judged(
+    stage: str,
+    loop: Factor,
+    verdict: Verdict,
+    reason: str,
+    detail: str,
+    statistic: float | None,
+    threshold: float | None,
+    **basis: Any,
+) -> Decision:
+    """A decision of a stage about a loop."""
+    return Decision(
+        loop.stamp, loop.id, loop.source, verdict, stage, reason, detail, statistic, threshold,
+        loop.stamps, basis=basis,
+    )  # fmt: skip

@@ -6,17 +6,16 @@ a robot that really came back sees the same place again a few metres on, and wha
 """
 
 from collections.abc import Iterable
-from typing import Any
 
 import numpy as np
 
 from ..config import Config
-from ..graph import Decision, Delta, Estimate, Factor, Verdict
+from ..graph import Decision, Delta, Estimate, Factor
 from .accord import Ruler
 from .chi2 import chi2_quantile
 from .held import Held
 from .paths import Path, Paths
-from .stage import Judged
+from .stage import Judged, judged
 
 SHARPER = 3.0  # how much surer than the gate odometry between two loops must be, for them to be witnesses
 TURNS = 8  # of what waits, looked at with each loop that enters
@@ -103,7 +102,7 @@ class Witness:
         if path is None:
             # nothing could contradict it, and apart from it the two parts have no place to each other at all; if it is wrong,
             # the gate finds that those which it shuts out agree with each other
-            return _decision(loop, "accepted", "joins", "the first to connect two parts", None, None)
+            return judged("witness", loop, "accepted", "joins", "the first to connect two parts", None, None)
         measured = self._paths.path_of(loop)
         found = self._ruler.compare(measured, path)
         if loop.id in self._waiting:
@@ -112,12 +111,12 @@ class Witness:
             return None
         if found.sure <= self._config.near:
             words = f"the graph knows to within {found.sure:.2g} m where it ends"
-            return _decision(loop, "accepted", "near", words, found.sure, self._config.near)
+            return judged("witness", loop, "accepted", "near", words, found.sure, self._config.near)
         if exact := self._exact(loop, path, estimate):
             return exact
         if found.statistic <= self._lone:
             words = f"alone, and close to where {path.meters:.0f} m of odometry expect it"
-            return _decision(loop, "accepted", "lone", words, found.statistic, self._lone)
+            return judged("witness", loop, "accepted", "lone", words, found.statistic, self._lone)
         return None
 
     def _exact(self, loop: Factor, path: Path, estimate: Estimate) -> Decision | None:
@@ -130,7 +129,7 @@ class Witness:
         if statistic > self._ruler.widest:
             return None
         words = f"{who} it here, to within its own noise: no chance would do that"
-        return _decision(loop, "accepted", "exact", words, statistic, self._ruler.widest)
+        return judged("witness", loop, "accepted", "exact", words, statistic, self._ruler.widest)
 
     def _surprise(self, loop: Factor, estimate: Estimate) -> float:
         """How far the estimate is from it, in its own noise."""
@@ -145,8 +144,8 @@ class Witness:
             return {}
         ids = sorted(member.id for member in clique)
         return {
-            member.id: _decision(
-                member, "accepted", "clique", f"agrees with {_listed(ids, member.id)}, and these with each other",
+            member.id: judged(
+                "witness", member, "accepted", "clique", f"agrees with {_listed(ids, member.id)}, and these with each other",
                 len(ids) - 1, self._config.others, clique=ids,
             )
             for member in clique
@@ -164,8 +163,8 @@ class Witness:
         missing = self._config.others - others
         words = f"{'no' if others == 0 else others} witness{'es' * (others > 1)}"
         words += f"; would enter with {missing} more loop{'s' * (missing > 1)} that agree with it{' and with each other' * (missing + others > 1)}"
-        return _decision(
-            loop, "probation", "no_witness", words, others, self._config.others, clique=clique, against=against, missing=missing,
+        return judged(
+            "witness", loop, "probation", "no_witness", words, others, self._config.others, clique=clique, against=against, missing=missing,
         )  # fmt: skip
 
     def _crowded(self) -> Iterable[Decision]:
@@ -175,23 +174,10 @@ class Witness:
             del self._waiting[loop.id]
             self._known.drop(loop.id)
             words = f"more than {self._config.held} loops wait for witnesses, and this one has waited longest"
-            yield _decision(loop, "refused", "crowded_out", words, len(self._waiting) + 1, self._config.held)
+            yield judged(
+                "witness", loop, "refused", "crowded_out", words, len(self._waiting) + 1, self._config.held
+            )
 
 
 def _listed(ids: Iterable[str], but: str) -> str:
     return ", ".join(id_ for id_ in ids if id_ != but)
-
-
-def _decision(
-    loop: Factor,
-    verdict: Verdict,
-    reason: str,
-    detail: str,
-    statistic: float | None,
-    threshold: float | None,
-    **basis: Any,
-) -> Decision:
-    return Decision(
-        loop.stamp, loop.id, loop.source, verdict, "witness", reason, detail, statistic, threshold,
-        loop.stamps, basis=basis,
-    )  # fmt: skip
