@@ -9,12 +9,18 @@ import typer
 if TYPE_CHECKING:
     from ..lab.evaluate import Errors
 
+GNSS = "gnss"  # the truth of a run that kept fixes back
 TRAJECTORIES = ("trajectory", "online", "odometry")  # of a run directory
 
 
 def command(
     run: Annotated[Path, typer.Argument(metavar="RUN", help="A run directory, or a trajectory file.")],
-    truth: Annotated[Path, typer.Option(metavar="F", help="TUM, KITTI, EuRoC or csv file, or a bag.")],
+    truth: Annotated[
+        Path,
+        typer.Option(
+            metavar="F", help="TUM, KITTI, EuRoC or csv file, or a bag; or `gnss`: the run's own fixes."
+        ),
+    ],
     topic: Annotated[str, typer.Option(metavar="T", help="Of a bag with several topics of poses.")] = "",
     align: Annotated[
         Literal["none", "origin", "se2", "se3", "sim3"],
@@ -37,6 +43,9 @@ def command(
 
     Of a run: of the smoothed trajectory, of what was believed at the time (online), and of odometry alone.
     """
+    if str(truth) == GNSS:
+        _against_fixes(run, as_json)
+        return
     from dataclasses import asdict
 
     from ..lab.evaluate import How, evaluate
@@ -54,6 +63,23 @@ def command(
         return
     typer.echo(f"{run} against {truth}, {_aligned(align)}; root mean squares")
     for line in _table(found):
+        typer.echo(line)
+
+
+def _against_fixes(run: Path, as_json: bool) -> None:
+    from ..lab.fixes import evaluate_fixes
+
+    found = evaluate_fixes(run)
+    if as_json:
+        typer.echo(json.dumps({"truth": GNSS, **found}))
+        return
+    typer.echo(f"{run} against its fixes, horizontally; metres")
+    rows = [["", "fixes", "rmse", "median", "max"]]
+    for name, errors in found.items():
+        rows.append(
+            [name, f"{errors['count']:.0f}", *(f"{errors[k]:.3f}" for k in ("rmse", "median", "max"))]
+        )
+    for line in columns(rows):
         typer.echo(line)
 
 

@@ -10,9 +10,12 @@ from slam_backend.core.errors import BadFile
 from slam_backend.core.sensors.gnss import enu
 from slam_backend.io.configfile import load_config
 from slam_backend.io.earth import NAME, read_fixes
+from slam_backend.io.finished import FinishedRun
 from slam_backend.io.maps import export
 from slam_backend.io.replay import replay
-from slam_backend.io.rundir import FinishedRun, write_run
+from slam_backend.io.rundir import write_run
+from slam_backend.lab.report import earth, write_report
+from slam_backend.lab.report.subject import Subject
 from slam_backend.lab.sensing import ORIGIN, on_earth
 from slam_backend.lab.simulate import Options, simulate, write_simulation
 
@@ -77,3 +80,24 @@ def test_before_the_yaw_is_known_a_run_says_so(tmp_path, capsys):
     assert "on the earth: unknown (3 fixes): yaw not yet observable" in capsys.readouterr().out
     assert main(["convert", str(tmp_path / "run"), str(tmp_path / "a.kml")]) == 2
     assert "--origin LAT,LON" in capsys.readouterr().err
+
+
+def test_a_run_is_evaluated_against_the_fixes_that_were_kept_back(drive, capsys):
+    _, _, run = drive
+    assert main(["evaluate", str(run.path), "--truth", "gnss", "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert (found["withheld"]["count"], found["used"]["count"]) == (10, 40)
+    told = run.summary["earth"]["away"]["withheld"]["horizontal"]
+    assert found["withheld"]["rmse"] == pytest.approx(told, rel=1e-6)
+    assert found["interpolated"]["rmse"] > 0
+
+
+def test_the_report_shows_the_fixes_beside_the_path(drive, tmp_path):
+    _, _, run = drive
+    section = earth.section(Subject(run.path))
+    assert set(section.figures) == {"earth", "fixes"}
+    names = [trace["name"] for trace in section.figures["earth"]["data"]]
+    assert "10 kept back as a truth" in names
+    assert names[-1] == "smoothed path"
+    write_report(Subject(run.path), tmp_path / "report.html")
+    assert "On the earth" in (tmp_path / "report.html").read_text(encoding="utf-8")

@@ -9,6 +9,7 @@ from pathlib import Path
 from . import (
     convergence,
     drift,
+    earth,
     health,
     loops,
     neighbours,
@@ -31,6 +32,7 @@ SECTIONS: Sequence[Callable[[Subject], Section | None]] = (
     loops.section,
     unguarded.section,
     drift.section,
+    earth.section,
     residuals.section,
     neighbours.section,
     convergence.section,
