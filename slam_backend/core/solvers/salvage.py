@@ -30,16 +30,16 @@ def salvaged(
 ) -> tuple[list[Factor], gtsam.Values]:
     """Factors that can be solved, and where from. Some may be new, and hold poses where they are.
 
-    starts: values of every variable, those that are tried first before others.
+    starts: values of every variable; first those that are believed.
     """
-    last = starts[-1]
-    tree, rest = _tree(factors, last, space)
+    believed = starts[0]
+    tree, rest = _tree(factors, believed, space)
     for start in starts:
         found = solve(tree, layout(tree, start).touched(start))
         if found is not None:
             return _with_others(tree, rest, found, start, solve)
-    held = [_anchor(key, last, space) for key in last.keys() if is_pose(key)]  # noqa: SIM118  # no dict
-    return held, layout(held, last).touched(last)
+    held = [_anchor(key, believed, space) for key in believed.keys() if is_pose(key)]  # noqa: SIM118  # no dict
+    return held, layout(held, believed).touched(believed)
 
 
 def _tree(factors: Iterable[Factor], values: gtsam.Values, space: Space) -> tuple[list[Factor], list[Factor]]:
@@ -48,7 +48,7 @@ def _tree(factors: Iterable[Factor], values: gtsam.Values, space: Space) -> tupl
 
     def root(key: int) -> int:
         while above.setdefault(key, key) != key:
-            key = above[key]
+            above[key] = key = above[above[key]]
         return key
 
     tree, rest = [], []
