@@ -404,12 +404,11 @@ class Backend:
         """A new keyframe at a stamp that the odometry covers, with everything that lands there."""
         a = self._newest[0] if self._newest else None
         driver, settings = str(self._driver), self.config.sources[str(self._driver)]
-        level = self._inertial.level() if self._inertial else None
         stretch = self._stretched(stamp)
         if settings.kind == "imu" and stretch is None:
             return []
         if a is None:
-            b, delta = self._growth.start(stamp, level)
+            b, delta = self._growth.start(stamp, self._inertial.level() if self._inertial else None)
         else:
             b, delta = self._growth.follow(a, stamp), Delta()
         motion = [Offer("", Measurement(stamp, driver), motion=True)]

@@ -116,6 +116,7 @@ class Inertial:
         self._flaw = ""
         self._bias = Bias()  # last believed
         self._slope, self._straight = 0.0, 0  # of the vertical acceleration, per ns; ns
+        self._period = PERIOD  # s between the newest two samples
         self._decisions: list[Decision] = []
 
     def take_decisions(self) -> list[Decision]:
@@ -130,16 +131,20 @@ class Inertial:
             self._mount, self._params = mount, None
         if self._from is None:
             self._collect(sample)
-        self._note_straight(sample, self._samples[-1] if self._samples else self._before or sample)
+        self._compare(sample, self._samples[-1] if self._samples else self._before or sample)
         self._samples.append(sample)
         if len(self._samples) > KEPT:
             self._integrate(self._samples[KEPT // 2].stamp)
             self._drop(KEPT // 2)
             self._cuttable = self._at
 
-    def _note_straight(self, sample: ImuSample, before: ImuSample) -> None:
-        """For how long (ns) samples have been lying on a straight line that is not level: somebody filled a gap with them."""
+    def _compare(self, sample: ImuSample, before: ImuSample) -> None:
+        """How far apart samples are, and for how long (ns) they have been lying on a straight line that is not level: somebody
+        filled a gap with them.
+        """
         elapsed, last = sample.stamp - before.stamp, self._slope
+        if 0 < elapsed <= self._config.max_gap * SECOND:
+            self._period = elapsed / SECOND
         self._slope = float(sample.acceleration[2] - before.acceleration[2]) / elapsed if elapsed > 0 else 0.0
         on = self._slope != 0 and abs(self._slope - last) <= STRAIGHT * abs(self._slope)
         self._straight = self._straight + elapsed if on else 0
@@ -300,11 +305,10 @@ class Inertial:
     def _noise(self) -> ImuNoise:
         """As configured; by the newest sample where the messages are to tell, and do."""
         stated, config = self._config.stated, self._config
-        if config.noise == "preset" or not self._samples:
+        newest = self._samples[-1] if self._samples else self._before
+        if config.noise == "preset" or newest is None:
             return stated
-        n = len(self._samples) - 1
-        newest = self._sample(n)
-        period = (newest.stamp - self._sample(n - 1).stamp) / SECOND or PERIOD
+        period = self._period
         rate = _variance(newest.rate_covariance) if config.gyroscope_density is None else None
         acceleration = (
             _variance(newest.acceleration_covariance) if config.accelerometer_density is None else None

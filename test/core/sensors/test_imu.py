@@ -314,6 +314,26 @@ def test_a_fix_that_comes_late_cuts_the_stretch_as_if_it_had_come_in_time():
             np.testing.assert_allclose(*(each.motion.covariance for each in found), rtol=1e-3)
 
 
+def test_the_noise_is_that_of_the_messages_where_these_are_to_tell():
+    """At each keyframe, be it at a sample or between two: the variance of one sample times the time between them."""
+    flight = Flight(0)
+    stated = frozen(np.eye(3).ravel() * 4.0)
+    inertial = Inertial("imu", ImuSource(noise="message", accelerometer_density=0.3))
+    state = State(flight.stamps[0], gtsam.Pose3(), np.zeros(3), gtsam.imuBias.ConstantBias())
+    samples = [
+        replace(each, rate_covariance=stated, acceleration_covariance=stated) for each in flight.samples
+    ]
+    inertial.add(replace(samples[0], stamp=flight.stamps[0]), None)
+    for n, begin in ((1, samples[4].stamp), (5, samples[9].stamp + 1000), (10, samples[20].stamp)):
+        for sample in samples[n : n + 11]:
+            if sample.stamp <= begin:
+                inertial.add(sample, None)
+        inertial.begin(replace(state, stamp=begin), begin)
+        params = inertial._params  # what the factors are made with
+        np.testing.assert_allclose(np.diag(params.getGyroscopeCovariance()), 4.0 / RATE, rtol=1e-6)
+        np.testing.assert_allclose(np.diag(params.getAccelerometerCovariance()), 0.09)
+
+
 def test_a_plane_and_a_second_imu_are_refused():
     imu = {"kind": "imu"}
     with pytest.raises(BadConfig, match="needs space: 3d"):
