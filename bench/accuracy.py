@@ -10,12 +10,12 @@ from pathlib import Path
 import yaml
 
 from bench.drive import drive
-from bench.fixes import away, away_by_lines, rms
 from bench.kitti import kitti
 from bench.sightings import mrclam, victoria_park_raw
 from bench.table import Row, markdown
 from slam_backend.core.config import config_from
 from slam_backend.io.replay import replay
+from slam_backend.lab.fixes import away, away_by_lines, rms
 
 TITLE = "Accuracy on real data"
 EXPLANATION = (

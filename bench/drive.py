@@ -6,13 +6,13 @@ from tempfile import TemporaryDirectory
 import numpy as np
 import yaml
 
-from bench.fixes import away, away_by_lines
 from bench.table import Row
 from slam_backend.core.config import config_from
 from slam_backend.core.measurement import SECOND
 from slam_backend.io.bags import write_bag
 from slam_backend.io.replay import replay
 from slam_backend.lab import rtklib
+from slam_backend.lab.fixes import away, away_by_lines
 
 FOLDER = Path(__file__).parents[2] / "shared/data/gnss_imu_rtklibexplorer/drive_0708"
 PARKED = 34.0  # s: of the 39 s in which the car stands at first; an IMU alone has drifted away by their end

@@ -6,7 +6,6 @@ from tempfile import TemporaryDirectory
 import numpy as np
 from gtsam.symbol_shorthand import B
 
-from bench.fixes import away, away_by_lines, rms
 from bench.table import Row
 from slam_backend.core.fixes import Compared
 from slam_backend.core.measurement import SECOND, Array
@@ -14,6 +13,7 @@ from slam_backend.io.configfile import load_config
 from slam_backend.io.replay import replay
 from slam_backend.io.result import Result
 from slam_backend.lab.datasets import make_dataset
+from slam_backend.lab.fixes import away, away_by_lines, rms
 
 CONFIG = Path(__file__).parents[1] / "config/kitti_imu_gnss.yaml"
 EVERY, OFFSETS = 10, (0, 2, 5, 7)
