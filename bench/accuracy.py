@@ -11,6 +11,7 @@ import yaml
 
 from bench.drive import drive
 from bench.kitti import kitti
+from bench.plaza import plaza
 from bench.sightings import mrclam, victoria_park_raw
 from bench.table import Row, markdown
 from slam_backend.core.config import config_from
@@ -57,6 +58,7 @@ SETS: Mapping[str, Callable[[], list[Row]]] = {
     "kitti": kitti,
     "mrclam": mrclam,
     "victoria_park_raw": victoria_park_raw,
+    "plaza": plaza,
 }  # name -> rows; none where the data are not at hand
 
 

@@ -122,8 +122,10 @@ def kind_of(record: Record, typestore: Any) -> str | None:
         return "gnss"
     if "@" in message.header.frame_id:
         return "relative"
+    is_tag = ":" in getattr(message, "child_frame_id", "")  # family:number
     in_map = message.header.frame_id.lstrip("/") == "map"
-    return "pose" if in_map and record.type == "geometry_msgs/msg/PoseWithCovarianceStamped" else "odometry"
+    absolute = in_map and record.type == "geometry_msgs/msg/PoseWithCovarianceStamped"
+    return "landmark" if is_tag else "pose" if absolute else "odometry"
 
 
 def _kind_of_cloud(message: Any) -> str | None:

@@ -26,6 +26,7 @@ FORMS = frozenset(get_args(Form))
 
 UNNAMED = "?"  # the frame of a sensor that its messages do not tell
 NAMELESS = "?"  # what no message calls a landmark: which one it is must be found out
+UPRIGHT = 0.5  # cosine of a sensor's tilt; below, its x and y are not those of the ground
 COUNTABLE = 2.0**53  # of double precision
 NEAREST = 1e-6  # m; nearer, a landmark has no direction
 
@@ -121,7 +122,21 @@ def decode_range(message: Message, source: str) -> Iterable[LandmarkObservation]
         )
 
 
+def decode_tag(message: Message, source: str) -> LandmarkObservation:
+    """nav_msgs/msg/Odometry: one tag, named by `child_frame_id`, seen by the camera `header.frame_id`. Its position counts; its
+    orientation, which a small image tells badly and of two ways at that, does not.
+    """
+    camera, _ = parse_frame(message.header.frame_id)
+    p = message.pose.pose.position
+    covariance = np.array(message.pose.covariance, dtype=np.float64).reshape(6, 6)[:3, :3]
+    return LandmarkObservation(
+        stamp_of(message), source, camera, message.child_frame_id, "position",
+        frozen((p.x, p.y, p.z)), frozen(covariance),
+    )  # fmt: skip
+
+
 DECODERS: Mapping[str, Decoder] = {
+    "nav_msgs/msg/Odometry": decode_tag,
     "sensor_msgs/msg/PointCloud2": decode_points,
     "sensor_msgs/msg/Range": decode_range,
 }
@@ -194,11 +209,32 @@ def _mount(m: LandmarkObservation, context: Context, config: LandmarkSource) -> 
     return context.mount(config.frame if m.frame == UNNAMED else m.frame)
 
 
+def _level(
+    m: LandmarkObservation, context: Context, config: LandmarkSource
+) -> tuple[LandmarkObservation, Pose]:
+    """The sighting, and where its sensor sits. In the plane, a position in the optical frame of a camera, or of another
+    sensor that lies on its side, is turned upright in space before its height is dropped.
+    """
+    mount = _mount(m, context, config)
+    if context.space.name == "3d" or m.form != "position":
+        return m, mount
+    whole = context.mounts.whole(m.frame)
+    turn = np.eye(3) if whole is None else whole.rotation().matrix()
+    if whole is None or turn[2, 2] > UPRIGHT:
+        return m, mount
+    if not np.isfinite(m.value).all():
+        raise Unusable("not_finite", "a tilted sensor needs x, y and z")
+    noise = defaulted(m.covariance, np.eye(3) * config.sigma_position**2)
+    upright = replace(m, value=whole.transformFrom(m.value), covariance=turn @ noise @ turn.T)
+    return upright, context.space.identity
+
+
 def _sight(offer: Offer, context: Context, config: LandmarkSource, points: dict[int, Array]) -> Factor | Wait:
     """One sighting; a landmark that it makes is added to `points`."""
     m = offer.measurement
     assert isinstance(m, LandmarkObservation)
-    placed, mount = context.landing(m.stamp), _mount(m, context, config)
+    m, mount = _level(m, context, config)
+    placed = context.landing(m.stamp)
     key, pose_key, space = context.landmark(m.landmark), placed.keyframe.pose, context.space
     known = key in points or context.component(key) is not None
     value, covariance = _in_space(m, context, config)

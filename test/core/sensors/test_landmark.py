@@ -12,7 +12,14 @@ from slam_backend.core.context import Correction
 from slam_backend.core.errors import BadMessage
 from slam_backend.core.graph import UNTIL_JOINED, Wait
 from slam_backend.core.measurement import SECOND, frozen
-from slam_backend.core.sensors.landmark import LandmarkObservation, decode_points, decode_range, factors
+from slam_backend.core.mounts import Mounts
+from slam_backend.core.sensors.landmark import (
+    LandmarkObservation,
+    decode_points,
+    decode_range,
+    decode_tag,
+    factors,
+)
 
 KEYFRAMES = (2, 6, 11)  # s
 AT_KEYFRAME, AFTER, BEFORE = 6 * SECOND, 7 * SECOND + SECOND // 3, 5 * SECOND - SECOND // 7
@@ -221,6 +228,41 @@ def test_the_kernel_of_the_source_is_around_the_noise(world, offered):
     seen = sighting(world, "position", "", AT_KEYFRAME, np.full((3, 3), np.nan))
     (made,) = factors(offered(seen), None, None, world.context(), LandmarkSource(kernel="cauchy")).add
     assert isinstance(made.factor.noiseModel(), gtsam.noiseModel.Robust)
+
+
+# -- tags of nav_msgs/Odometry -----------------------------------------------------------------------------------
+
+
+def tag_message(x, y, z, covariance=None) -> SimpleNamespace:
+    header = SimpleNamespace(stamp=SimpleNamespace(sec=6, nanosec=0), frame_id="camera")
+    pose = SimpleNamespace(position=SimpleNamespace(x=x, y=y, z=z))
+    told = SimpleNamespace(pose=pose, covariance=np.zeros(36) if covariance is None else covariance)
+    return SimpleNamespace(header=header, child_frame_id="tag36h11:5", pose=told)
+
+
+def test_a_tag_is_a_landmark_that_is_named_by_its_family_and_number():
+    covariance = np.zeros((6, 6))
+    covariance[:3, :3] = np.diag([0.01, 0.02, 0.03])
+    seen = decode_tag(tag_message(1.0, 2.0, 3.0, covariance.ravel()), "tags")
+    assert (seen.stamp, seen.source, seen.frame, seen.landmark) == (
+        6 * SECOND,
+        "tags",
+        "camera",
+        "tag36h11:5",
+    )
+    assert (seen.form, seen.value.tolist()) == ("position", [1.0, 2.0, 3.0])
+    np.testing.assert_array_equal(seen.covariance, np.diag([0.01, 0.02, 0.03]))
+
+
+def test_in_the_plane_too_an_optical_frame_looks_along_its_z_axis(world, offered):
+    """x of an optical frame is to the right, y down: a tag 5 m ahead and 1 m to the right is there in either space."""
+    optical = {"camera": (0.3, 0.0, 0.6, -np.pi / 2, 0.0, -np.pi / 2)}
+    context = replace(world.context(), mounts=Mounts(world.space, "base_link", optical))
+    seen = replace(decode_tag(tag_message(1.0, 0.2, 5.0), "tags"), landmark="oak")
+    world.known.discard("oak")
+    delta = factors(offered(seen), None, None, context, LandmarkSource())
+    from_base = world.pose(delta.add[0].keys[0]).transformTo(delta.values[world.key("oak")])
+    np.testing.assert_allclose(from_base, [5.3, -1.0, 0.4][: world.space.point_dimension], atol=1e-9)
 
 
 # -- ranges of sensor_msgs/Range ---------------------------------------------------------------------------------
