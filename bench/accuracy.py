@@ -13,6 +13,7 @@ from bench.drive import drive
 from bench.kitti import kitti
 from bench.plaza import plaza
 from bench.sightings import mrclam, victoria_park_raw
+from bench.stereo import stereo
 from bench.table import Row, markdown
 from slam_backend.core.config import config_from
 from slam_backend.io.replay import replay
@@ -56,6 +57,7 @@ SETS: Mapping[str, Callable[[], list[Row]]] = {
     "husky": husky,
     "drive_0708": drive,
     "kitti": kitti,
+    "kitti_stereo": stereo,
     "mrclam": mrclam,
     "victoria_park_raw": victoria_park_raw,
     "plaza": plaza,

@@ -128,7 +128,7 @@ def _write_decisions(path: Path, result: Result) -> None:
 def _write_landmarks(path: Path, result: Result) -> None:
     """id, kind, position, upper triangle of its covariance (m^2), number of observations."""
     backend, snapshot = result.run.backend, result.snapshot
-    seen = Counter(factor.keys[-1] for factor in result.factors if factor.kind == "landmark")
+    seen = Counter(factor.keys[-1] for factor in result.factors if factor.kind in ("landmark", "pixel"))
     with path.open("w", encoding="utf-8", newline="") as file:
         out = csv.writer(file, lineterminator="\n")
         out.writerow(
