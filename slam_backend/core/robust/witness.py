@@ -18,7 +18,7 @@ from .paths import Path, Paths
 from .stage import Judged, judged
 
 SHARPER = 3.0  # how much surer than the gate odometry between two loops must be, for them to be witnesses
-TURNS = 8  # of what waits, looked at with each loop that enters
+GLANCES = 8  # of what waits, whether the graph has come to expect it, with each loop that enters
 
 
 class Witness:
@@ -31,7 +31,8 @@ class Witness:
         self._known = Held(paths, config)  # in the graph or waiting
         self._waiting: dict[str, float] = {}  # how far off (m) the graph may be about where they end
         self._fresh: list[Factor] = []  # not told about yet
-        self._round: list[str] = []  # of what waits, whose turn comes yet; the next one last
+        self._round: list[str] = []  # of what waits, whose turn comes yet
+        self._glances: list[str] = []  # the same, of a shorter look
         self._entered = self._left = 0  # of what came into the graph, and went
         self._changes = 0  # of the graph's loops, when it was last somebody's turn
 
@@ -90,11 +91,14 @@ class Witness:
         if self._entered + self._left == self._changes:
             return []
         self._changes = self._entered + self._left
-        self._round = [id_ for id_ in self._round if id_ in self._waiting] or list(self._waiting)[::-1]
-        turns = [self._known[self._round.pop()] for _ in range(min(TURNS, len(self._round)))]
-        return turns[:1] + [
-            loop for loop in turns[1:] if self._surprise(loop, estimate) <= self._ruler.widest
-        ]
+        glanced = self._next(self._glances, GLANCES)
+        expected = [loop for loop in glanced if self._surprise(loop, estimate) <= self._ruler.widest]
+        return self._next(self._round, 1) + expected
+
+    def _next(self, turns: list[str], count: int) -> list[Factor]:
+        """Of what waits so many in turn. turns: whose comes yet, the next one last."""
+        turns[:] = [id_ for id_ in turns if id_ in self._waiting] or list(self._waiting)[::-1]
+        return [self._known[turns.pop()] for _ in range(min(count, len(turns)))]
 
     def _alone(self, loop: Factor, estimate: Estimate) -> Decision | None:
         """Why it may enter without others, if it may."""
