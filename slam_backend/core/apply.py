@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
+from functools import cache
 from typing import Any
 
 from .errors import SolverFailure
@@ -204,12 +205,13 @@ class Applier:
             self.sighted.pop(key, None)
 
     def _book(self, delta: Delta) -> None:
+        asked = cache(self._started(delta))  # a camera makes hundreds of points at one pose
         for factor in delta.add:
             fresh = [key for key in factor.keys if self._parts.of(key) is None]
             pose = pose_beside(factor.keys[0])
             for key in fresh:
                 self._parts.put(key, pose)
-                self.sighted[key] = (pose, self._from(pose, delta, key))
+                self.sighted[key] = (pose, seen_from(asked(pose), key, delta.values[key]))
                 self._wake(key)
             if factor.kind == "datum" and (part := self._parts.of(factor.keys[0])) is not None:
                 self._parts.release(part)
@@ -217,11 +219,16 @@ class Applier:
                 self.decisions.append(self._verdicts.get(factor.id) or _accepted(factor))
         self._booked(delta)
 
-    def _from(self, pose_key: int, delta: Delta, key: int) -> Any:
-        """The first guess of a variable, seen from a pose."""
-        assert self.estimate is not None
-        pose = delta.values.get(pose_key)
-        return seen_from(self.estimate.pose(pose_key) if pose is None else pose, key, delta.values[key])
+    def _started(self, delta: Delta) -> Callable[[int], Pose]:
+        """The first guess of a pose; of one that has been there before, what is believed."""
+        estimate = self.estimate
+        assert estimate is not None
+
+        def pose_of(key: int) -> Pose:
+            guess = delta.values.get(key)
+            return estimate.pose(key) if guess is None else guess
+
+        return pose_of
 
 
 def shift_of(event: Factor, poses: Sequence[Pose], last: bool) -> Pose:

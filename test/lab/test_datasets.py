@@ -13,7 +13,7 @@ from slam_backend.core.config import config_from
 from slam_backend.core.errors import BadConfig
 from slam_backend.core.geometry import covariance_from_ros, inverse_of, matrix_of
 from slam_backend.core.measurement import SECOND
-from slam_backend.core.sensors import landmark, odometry, relative
+from slam_backend.core.sensors import camera, landmark, odometry, pixels, relative
 from slam_backend.io.bags import open_bag
 from slam_backend.io.configfile import load_config
 from slam_backend.io.formats import tum
@@ -192,3 +192,27 @@ def test_kitti_has_an_imu_and_fixes_and_its_configuration_finds_yaw_and_speed(tm
     away = np.linalg.norm((found.antennas - found.fixes)[inside, :2], axis=1)
     assert len(away) > 10
     assert away.max() < 0.3
+
+
+def test_kitti_stereo_has_every_sighting_and_the_right_cameras_baseline(tmp_path: Path) -> None:
+    """52544 of 15638 features in 77 images, as the text has them: u left, u right, v."""
+    path = make_dataset("kitti_stereo", tmp_path / "stereo.mcap").path
+    frames = decoded(path, "/features", pixels.decode)
+    assert len(frames) == 77
+    assert sum(len(frame.ids) for frame in frames) == 52_544
+    assert len({number for frame in frames for number in frame.ids.tolist()}) == 15_638
+    assert (frames[0].ids[0], *frames[0].pixels[0]) == (7, 322.497, 11.6692, 299.487)
+    info = decoded(path, "/camera_right/camera_info", camera.decode_info)[0]
+    assert info.rectified == (718.856, 718.856, 607.1928, 185.2157, pytest.approx(0.5371657189))
+
+
+@pytest.mark.slow
+def test_kitti_stereo_ends_at_the_optimum_that_gtsam_finds(tmp_path: Path) -> None:
+    """7399.0425 with every sighting let in, the first camera fixed."""
+    path = make_dataset("kitti_stereo", tmp_path / "stereo.mcap").path
+    config = load_config(ROOT / "config/kitti_stereo.yaml")
+    every = ("features.probability=1", "features.share=10")
+    summary = replay(path, config, every, final="batch").result.summary
+    assert summary["counts"]["landmarks"] == 15_638
+    assert summary["cost"]["final"] == pytest.approx(7399.0425, rel=1e-3)
+    assert not any(rule.startswith(("pixels/", "points/")) for rule in summary["decisions"])
