@@ -159,11 +159,14 @@ class Tracker:
 
     def _reviewed(self, frame: Frame, context: Context, poses: Poses) -> tuple[InGraph, Delta]:
         """The tracks of the graph that are in view or were in the last frame, less those that are given up now."""
-        last, now = {id(each) for each in self._frames[-1:]}, set(frame.ids.tolist())
+        last, now = self._frames[-1:], set(frame.ids.tolist())
+        near = dict.fromkeys([*(n for each in last for n in each.ids.tolist()), *frame.ids.tolist()])
         tracks = [
             track
-            for track in self._tracks.values()
-            if track.factors and (track.id in now or id(track.newest) in last)
+            for number in near
+            if (track := self._tracks.get(number))
+            and track.factors
+            and (number in now or track.newest in last)
         ]
         if not tracks:
             return InGraph([], np.zeros((0, 3)), np.zeros((0, 3, 3))), Delta()
