@@ -11,7 +11,7 @@ from ..core.config import AnySource, Config, words_of
 
 HEAD = """# Settings
 
-Written by `make docs` from `core/config.py`. In YAML the sources are named in a list and described at the top level; any setting can be given
+Written by `make docs` from `core/config/`. In YAML the sources are named in a list and described at the top level; any setting can be given
 on the command line as `--set name=value`, for instance `--set isam2.relinearize_skip=1`.
 """
 
