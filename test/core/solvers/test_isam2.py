@@ -185,14 +185,20 @@ def test_a_failed_move_of_what_exists_loses_nothing():
     assert away(solver, estimate) < 1e-9
 
 
-@pytest.mark.parametrize("factorization", ["auto", "qr"])
-@pytest.mark.parametrize("what", ["gauge/0/0", "wheels/7/0", "trees/5/0"])
-def test_a_removal_that_leaves_something_afloat_is_refused(what, factorization):
-    """The gauge, the only edge to the poses behind, the only sighting of a landmark."""
+def with_tree(factorization="auto"):
+    """A drive of eight poses and a landmark that is seen once."""
     solver, estimate = driven(8, factorization=factorization, good=False)
     ranged = gtsam.BearingRangeFactor2D(X(5), L(0), gtsam.Rot2(0.3), 5.0, gtsam.noiseModel.Unit.Create(2))
     guess = {L(0): estimate.pose(X(5)).transformFrom(np.array([5.0, 1.5]))}
-    estimate = solver.update(Delta((Factor("trees/5/0", "landmark", ranged, (X(5), L(0)), 5),), values=guess))
+    sighting = Factor("trees/5/0", "landmark", ranged, (X(5), L(0)), 5)
+    return solver, solver.update(Delta((sighting,), values=guess))
+
+
+@pytest.mark.parametrize("factorization", ["auto", "qr"])
+@pytest.mark.parametrize("what", ["gauge/0/0", "wheels/7/0"])
+def test_a_removal_that_leaves_a_pose_afloat_is_refused(what, factorization):
+    """The gauge, the only edge to the poses behind."""
+    solver, estimate = with_tree(factorization)
     with pytest.raises(SolverFailure):
         solver.update(Delta(remove=(what,)))
     assert what in solver.factors
@@ -200,6 +206,16 @@ def test_a_removal_that_leaves_something_afloat_is_refused(what, factorization):
     assert away(solver, estimate) < 1e-9
     (incident,) = solver.incidents()
     assert f"without removing {what}" in incident.detail
+
+
+def test_a_landmark_leaves_with_its_last_sighting():
+    solver, estimate = with_tree()
+    estimate = solver.update(Delta(remove=("trees/5/0",)))
+    assert "trees/5/0" not in solver.factors
+    assert not estimate.knows(L(0))
+    assert estimate.values().size() == 8
+    assert not solver.incidents()
+    assert away(solver, solver.polish()) < 1e-9
 
 
 def test_a_factor_that_is_not_needed_can_be_removed():
