@@ -13,6 +13,7 @@ from .adopted import Adopted
 from .apply import Applier, without
 from .association import Associator
 from .beside import Beside
+from .budget import Budget
 from .calibration import Calibration
 from .command import Command
 from .config import Config, GnssSource, LandmarkSource, OdometrySource, PoseSource, RelativeSource
@@ -111,6 +112,7 @@ class Backend:
         self.solver = solver or SOLVERS["isam2"](config, space)
         self._paths = paths = Paths(space, config.gate.odometry_scale, self.solver.factors)
         self._quarantine = Quarantine(config, space, self.solver.factors)
+        self._budget = Budget(config, space, self.solver.factors, lambda: self._editor.wishes.ids)
         self._driver = config.driver
         if self._driver is None:
             raise BadConfig("no source drives the keyframes: add one of kind odometry, imu or relative")
@@ -150,7 +152,7 @@ class Backend:
         self._growth = Growth(space, self.timeline, self.track, self.parts)
         self._decisions: list[Decision] = []  # told with the next update
         self._newest: tuple[Keyframe, Pose] | None = None  # and its odometry pose
-        stages = _stages(config, paths, self._quarantine) if robust is None else robust
+        stages = _stages(config, paths, self._quarantine, self._budget) if robust is None else robust
         self._is_judged = bool(stages)
         self._applier = Applier(self.solver, space, self.parts, self._waiting.wake, self._book)
         self._editor = Editor(
@@ -603,6 +605,7 @@ class Backend:
         if self._is_judged:
             self._paths.book(delta)
             self._quarantine.book(delta)
+            self._budget.book(delta)
         if delta.remove:
             for key in self._quarantine.left(self.estimate.knows):
                 self.parts.drop(key)
@@ -718,7 +721,7 @@ class Backend:
         return Update(b, *sevens, self._revision, decisions, self._origin, told)
 
 
-def _stages(config: Config, paths: Paths, quarantine: Quarantine) -> list[Robust]:
+def _stages(config: Config, paths: Paths, quarantine: Quarantine, budget: Budget) -> list[Robust]:
     """What judges factors: loops as the configuration says, fixes on the earth and landmarks always."""
     landmarks = any(isinstance(source, LandmarkSource) for source in config.sources.values())
     fixes = any(isinstance(source, GnssSource) for source in config.sources.values())
@@ -726,4 +729,5 @@ def _stages(config: Config, paths: Paths, quarantine: Quarantine) -> list[Robust
         *(ROBUST[name](config, paths) for name in config.robust),
         *([Doubt(config, paths)] if fixes else []),
         *([quarantine] if landmarks else []),
+        *([budget] if landmarks and config.budget.sightings else []),
     ]

@@ -146,7 +146,9 @@ class Editor:
     def note(self, decisions: Iterable[Decision]) -> None:
         """What others decided about factors counts again where a person's wish is taken back."""
         for each in decisions:
-            if each.stage == "edit":
+            if each.stage == "budget" and each.verdict == "removed":
+                self._known.pop(each.id, None)  # others have taken over what it said: it cannot come back
+            elif each.stage == "edit":
                 self._overruled[each.id] = each.reason
             elif each.id in self._known:
                 self._said[each.id] = each.verdict
@@ -187,6 +189,9 @@ class Editor:
         held, before = self._solver.factors, self._applier.estimate.values()
         wishes = history.now
         edited = wishes.ids | self._history.now.ids
+        if spent := edited - self._known.keys() - held.keys():
+            gone = min(spent)
+            raise SlamError(f"'{gone}' has been summarized since: what became of it says decision/{gone}")
         kept = [factor for factor in held.values() if factor.kind != "gauge" and factor.id not in edited]
         fresh: list[Factor] = []
         for id_ in sorted(edited):

@@ -20,6 +20,7 @@ from .measurement import Array
 from .robust.chi2 import chi2_quantile
 from .robust.kernels import without_kernel
 from .robust.stage import Judged
+from .sensors.landmark import PLACED
 from .space import Space
 
 Reason = Literal["moved", "duplicate", "moving"]
@@ -27,7 +28,6 @@ Reason = Literal["moved", "duplicate", "moving"]
 REMEMBERED = 30  # sightings of a landmark that are looked at
 USUAL = 300  # residuals, of all landmarks, that say what is usual
 TIGHT = 4.0  # standard deviations of a sighting within which nine of ten sightings of one place lie
-PLACED = (gtsam.BearingRangeFactor2D, gtsam.BearingRangeFactor3D)
 
 
 @dataclass(slots=True, eq=False)

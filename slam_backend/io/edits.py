@@ -108,11 +108,12 @@ def arrivals(
 
 def without(id_: str, dropped: Collection[str]) -> str:
     """What an id becomes when some measurements of the same source and stamp are gone."""
-    head, _, n = id_.rpartition("/")
+    head, _, tail = id_.rpartition("/")
+    n, colon, which = tail.partition(":")
     before = sum(
         1 for each in dropped if each.rpartition("/")[0] == head and int(each.rpartition("/")[2]) < int(n)
     )
-    return f"{head}/{int(n) - before}"
+    return f"{head}/{int(n) - before}{colon}{which}"
 
 
 def _numbered(items: Items) -> Iterator[tuple[int, Measurement | Decision]]:

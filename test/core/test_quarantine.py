@@ -48,8 +48,8 @@ def told(drive: Simulation, name: str, displaced: Displaced) -> Iterator[Measure
             yield m
 
 
-def ran(drive: Simulation, items: Iterator[Measurement]) -> tuple[Backend, list]:
-    backend = Backend(config_from(drive.settings))
+def ran(drive: Simulation, items: Iterator[Measurement], **settings: object) -> tuple[Backend, list]:
+    backend = Backend(config_from({**drive.settings, **settings}))
     decisions = [d for item in items for update in backend.add(item) for d in update.decisions]
     return backend, decisions + [d for update in backend.finish() for d in update.decisions]
 
@@ -97,3 +97,15 @@ def test_landmarks_that_stand_still_stay_even_if_their_noise_is_larger_than_they
     for items in (drive.measurements, worse):
         _, decisions = ran(drive, items)
         assert not [d for d in decisions if d.stage == "quarantine"]
+
+
+@pytest.mark.parametrize("reason", ["moved", "moving"])
+def test_what_does_not_stand_still_is_found_out_within_a_budget_too(drive: Simulation, reason: str) -> None:
+    """Of whose old sightings only those are left that say most."""
+    name = culprit(drive)
+
+    def displaced(n: int, point: np.ndarray) -> np.ndarray:
+        return point + (np.array([1.5, -1.0, 0.0]) * (n >= 25) if reason == "moved" else [0.25 * n, 0.0, 0.0])
+
+    _, decisions = ran(drive, told(drive, name, displaced), budget={"sightings": 30})
+    assert {d.reason for d in decisions if d.stage == "quarantine"} == {reason}

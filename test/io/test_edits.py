@@ -73,6 +73,7 @@ def test_an_id_leads_to_the_measurement_that_has_it():
     }
     assert arrivals(items(), CONFIG, (6,), ids, settled_stream) == {"loops/5.000000000/0": 10}
     assert without("loops/5.000000000/1", ["loops/5.000000000/0"]) == "loops/5.000000000/0"
+    assert without("trees/5.000000000/1:4", ["trees/5.000000000/0"]) == "trees/5.000000000/0:4"
     assert (
         without("loops/5.000000000/1", ["loops/5.000000000/2", "gps/5.000000000/0"]) == "loops/5.000000000/1"
     )

@@ -84,6 +84,18 @@ class Quarantine(Section):
     )
 
 
+class Budget(Section):
+    """Bounded cost: what a landmark has been seen from before is summarized; nothing becomes surer by it."""
+
+    sightings: int = Field(
+        0,
+        ge=0,
+        le=1_000_000,
+        description="most factors that a landmark keeps; of more, old ones from one keyframe are combined, and then those that say "
+        "least go. 0: all stay",
+    )
+
+
 class Earth(Section):
     """Where the map lies on the earth, for sources of kind gnss: estimated, from what is known beforehand."""
 

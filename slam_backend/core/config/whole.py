@@ -5,7 +5,7 @@ from typing import Literal
 
 from pydantic import Field, model_validator
 
-from .estimation import Earth, Floor, Isam2, Keyframes, Quarantine, Settle
+from .estimation import Budget, Earth, Floor, Isam2, Keyframes, Quarantine, Settle
 from .node import Journaling, PathOutput
 from .section import Section
 from .sources import AnySource
@@ -46,6 +46,7 @@ class Config(Section):
     journal: Journaling = Journaling()
     floor: Floor = Floor()
     quarantine: Quarantine = Quarantine()
+    budget: Budget = Budget()
     path: PathOutput = PathOutput()
     earth: Earth = Earth()
     extrinsics: Mapping[str, tuple[float, float, float, float, float, float]] = Field(

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from math import isnan
 from typing import Any, Literal, get_args
 
+import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
@@ -29,6 +30,7 @@ NAMELESS = "?"  # what no message calls a landmark: which one it is must be foun
 UPRIGHT = 0.5  # cosine of a sensor's tilt; below, its x and y are not those of the ground
 COUNTABLE = 2.0**53  # of double precision
 NEAREST = 1e-6  # m; nearer, a landmark has no direction
+PLACED = (gtsam.BearingRangeFactor2D, gtsam.BearingRangeFactor3D)  # one says where its landmark is
 
 
 @dataclass(frozen=True, slots=True, eq=False)
