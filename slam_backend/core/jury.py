@@ -73,8 +73,9 @@ class Jury:
                     self.decisions.append(told)
             decided = {each.id for each in decisions}
             self._undecided |= {id_: each for id_, each in passed.items() if id_ not in decided | kept}
-        self._editor.note(self.decisions)
-        proposed, overruled = self._editor.respected(proposed, passed)
-        self.decisions += overruled
-        self._applier.apply(touched(proposed), passed)
+        if proposed:
+            self._editor.note(self.decisions)
+            proposed, overruled = self._editor.respected(proposed, passed)
+            self.decisions += overruled
+            self._applier.apply(touched(proposed), passed)
         self.decisions += self._applier.take_decisions()

@@ -121,8 +121,11 @@ class Quarantine:
 
     def _noted(self, fresh: Sequence[Factor], estimate: Estimate) -> list[int]:
         """Take the residuals of new sightings down; the landmarks of which too many have not fitted, where others did."""
+        if not fresh:
+            return []
         residuals = [self._residual(factor, estimate) for factor in fresh]
-        strange = [residual > self._limit() for residual in residuals]
+        limit = self._limit()
+        strange = [residual > limit for residual in residuals]
         by_pose: dict[int, list[bool]] = defaultdict(list)
         for factor, odd in zip(fresh, strange, strict=True):
             by_pose[factor.keys[0]].append(odd)

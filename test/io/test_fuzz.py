@@ -37,6 +37,7 @@ NOISE = np.diag([0.01, 0.01, 0.02, 0.001, 0.001, 0.002])
 BEGIN, STEP = 1000 * SECOND, SECOND // 5
 KEYFRAMES = 40
 AFAR = 1_000_000
+FOCAL, CENTRE = 300.0, 320.0  # pixels
 MOST, HALF = 0.8, 0.5  # of the sound keyframes survive; nothing tells how far a relative pose may reach
 
 
@@ -149,6 +150,34 @@ def inertial(n: int, stamp: int) -> bytes:
     return bytes(STORE.serialize_cdr(message, "sensor_msgs/msg/Imu"))
 
 
+def features(n: int, stamp: int) -> bytes:
+    """Lamps above the robot, seen by a camera that looks up."""
+    x, y, z, _, _, s, c = pose(n)
+    turn = np.array([[c * c - s * s, 2 * s * c], [-2 * s * c, c * c - s * s]])
+    lamps = np.array([(4.0 * i, 4.0 * j) for i in range(-4, 5) for j in range(-4, 5)])
+    seen = (lamps - (x, y)) @ turn.T - (0.1, 0.0)
+    u, v = (FOCAL * seen / (8.0 - z) + CENTRE).T
+    ids = np.flatnonzero((np.abs(u - CENTRE) < CENTRE) & (np.abs(v - CENTRE) < CENTRE))
+    return encode_cloud(stamp, "camera", {"id": ids.astype(np.int32), "u": u[ids], "v": v[ids]})
+
+
+def tag(n: int, stamp: int) -> bytes:
+    child = f"tag36h11:{n % 3}"
+    return encode_odometry(
+        stamp, "camera", child, (1.5, 0.2, 3.0, 0.0, 0.0, 0.0, 1.0), NOISE, np.zeros(6), NOISE
+    )
+
+
+def lens(n: int, stamp: int) -> bytes:
+    k = np.array([FOCAL + n % 2, 0, CENTRE, 0, FOCAL, CENTRE, 0, 0, 1.0])
+    p = np.insert(k, (3, 6, 9), 0.0)
+    region = STORE.types["sensor_msgs/msg/RegionOfInterest"](0, 0, 0, 0, False)
+    message = STORE.types["sensor_msgs/msg/CameraInfo"](
+        header(stamp, "camera"), 640, 640, "plumb_bob", np.zeros(5), k, np.eye(3).ravel(), p, 0, 0, region
+    )
+    return bytes(STORE.serialize_cdr(message, "sensor_msgs/msg/CameraInfo"))
+
+
 INPUTS = {
     "wheels": Input("odometry", "nav_msgs/msg/Odometry", odometry),
     "visual": Input("odometry", "geometry_msgs/msg/PoseWithCovarianceStamped", pose_with_covariance),
@@ -161,9 +190,16 @@ INPUTS = {
     "beacons": Input("landmark", "sensor_msgs/msg/Range", echo),
     "satellites": Input("gnss", "sensor_msgs/msg/NavSatFix", fix),
     "rates": Input("imu", "sensor_msgs/msg/Imu", inertial),
+    "tags": Input("landmark", "nav_msgs/msg/Odometry", tag),
+    "images": Input("pixels", "sensor_msgs/msg/PointCloud2", features),
+    "lens": Input("pixels", "sensor_msgs/msg/CameraInfo", lens),
     "/tf_static": Input("static", "tf2_msgs/msg/TFMessage", mounts),
 }
-OBSERVING = ("loops", "batches", "trees", "fixes", "beacons", "satellites", "rates", "/tf_static")
+OBSERVING = (
+    "loops", "batches", "trees", "fixes", "beacons", "satellites", "rates", "tags", "images", "lens",
+    "/tf_static",
+)  # fmt: skip
+SOLID = ("rates", "images", "lens")  # need 3-D
 SPECIAL = [
     np.nan,
     np.inf,
@@ -266,10 +302,12 @@ def world(driver: str, space: str, noise: str, seed: int, bad: int) -> tuple[Con
     robot is, and about when.
     """
     rng = np.random.default_rng(seed)
-    unfit = ("rates",) if space == "2d" or driver == "loops" else ()  # an IMU needs 3-D, and would drive
+    unfit = SOLID if space == "2d" else ("rates",) if driver == "loops" else ()  # an IMU would drive
     names = [driver, *(name for name in OBSERVING if name not in (driver, *unfit))]
     sources = {name: {"kind": INPUTS[name].kind, "topic": name} for name in names if name != "/tf_static"}
     sources[driver] |= {"noise": noise, "max_speed": 5.0} if INPUTS[driver].kind == "odometry" else {}
+    if "images" in sources:
+        sources["images"]["camera"] = {"fx": FOCAL, "fy": FOCAL, "cx": CENTRE, "cy": CENTRE}
     config = config_from(
         {"space": space, "keyframes": {"distance": 0.4}, "sources": list(sources), **sources}
     )
