@@ -8,7 +8,7 @@ A new kind is a row here; whoever moves, stores or compares variables asks this 
 """
 
 from collections.abc import Callable, Mapping
-from math import nan
+from math import isfinite, nan
 from typing import Any, NamedTuple
 
 import gtsam
@@ -109,5 +109,5 @@ def numbers(space: Space, key: int, value: Any) -> tuple[float, ...]:
 
 def largest(space: Space, key: int, value: Any) -> float:
     """Largest magnitude among its numbers; NaN if one is not finite."""
-    found = np.abs(numbers(space, key, value))
-    return float(found.max()) if np.isfinite(found).all() else nan
+    found = numbers(space, key, value)
+    return max(map(abs, found)) if all(map(isfinite, found)) else nan
