@@ -15,10 +15,11 @@ from .association import Associator
 from .beside import Beside
 from .budget import Budget
 from .calibration import Calibration
+from .coast import NAME, NOISE, Coaster, coasts, earth_from, floor_from, sight_of
 from .command import Command
 from .config import Config, GnssSource, LandmarkSource, OdometrySource, PoseSource, RelativeSource
 from .consistency import Fit
-from .context import Context, unknown_frame
+from .context import Context, Unusable, unknown_frame
 from .editor import Editor, Shift
 from .edits import Wishes
 from .errors import BadConfig, SlamError, SolverFailure
@@ -39,7 +40,7 @@ from .graph import (
     landmark_key,
     total,
 )
-from .growth import Growth
+from .growth import TILT, Growth
 from .inertial import ImuSample, Inertial, State, Stretch, imu_of, pace_from
 from .jury import Jury
 from .keyframes import Timeline, Track, due
@@ -55,6 +56,7 @@ from .sensors.camera import CameraModel
 from .sensors.gnss import Fix
 from .sensors.imu import bias_key, velocity_key
 from .sensors.odometry import HERE, OdometryPose, stated
+from .sensors.pose import AbsolutePose
 from .sensors.relative import RelativePose
 from .sessions import SavedMap, Tracks, fits, joined
 from .settle import FAR
@@ -115,14 +117,19 @@ class Backend:
         self._budget = Budget(config, space, self.solver.factors, lambda: self._editor.wishes.ids)
         self._driver = config.driver
         if self._driver is None:
-            raise BadConfig("no source drives the keyframes: add one of kind odometry, imu or relative")
+            raise BadConfig(
+                "no source drives the keyframes: add one of kind odometry, imu, relative, gnss or pose"
+            )
         driving = config.sources[self._driver]
         self._relative = driving.kind == "relative"
         self._imu = next((name for name, s in config.sources.items() if s.kind == "imu"), "")
         self._inertial = Inertial(self._imu, imu) if (imu := imu_of(config)) else None
         self._pace = pace_from(config)
         self._stretch: Stretch | None = None  # of the keyframe that is being made
-        self.track = Track(space, driving if isinstance(driving, OdometrySource) else OdometrySource())
+        self._coaster = Coaster(space, config.coast) if coasts(config) else None
+        self._earth, self._floor = earth_from(config), floor_from(config)
+        told = driving if isinstance(driving, OdometrySource) else OdometrySource()
+        self.track = Track(space, NOISE if self._coaster else told)
         self.tracks = Tracks(self.track)
         self.timeline = Timeline()
         self.parts = Parts()
@@ -209,6 +216,8 @@ class Backend:
         updates = self.complete(measurement.stamp)
         self._decisions += self._waiting.offer(measurement)
         self._is_complete = False
+        if self._coaster and measurement.source == self._driver:
+            updates += self._coast(measurement, self._coaster)
         return updates
 
     def complete(self, stamp: int) -> list[Update]:
@@ -402,6 +411,25 @@ class Backend:
             updates += self._reached(sample.stamp)
         return updates
 
+    def _coast(self, item: Measurement, coaster: Coaster) -> list[Update]:
+        """Nothing measures the motion: the track goes on as the positions before this one let expect."""
+        assert isinstance(item, Fix | AbsolutePose)
+        self._mounts.name_base(item.frame)
+        settings = self.config.sources[item.source]
+        assert isinstance(settings, GnssSource | PoseSource)
+        try:
+            steps = coaster.add(sight_of(item, self._context({}), settings))
+        except Unusable:  # its sensor will say so
+            return []
+        self._decisions += coaster.take_decisions()
+        updates: list[Update] = []
+        for step in steps:
+            if step.leaps and self._newest and self.track.newest > self._newest[0].stamp:
+                updates += self._extend(self.track.newest)
+            self.track.add(step.stamp, step.pose, step.covariance)
+            updates += self._reached(step.stamp, step.leaps)
+        return updates
+
     def _extend(self, stamp: int) -> list[Update]:
         """A new keyframe at a stamp that the odometry covers, with everything that lands there."""
         a = self._newest[0] if self._newest else None
@@ -410,11 +438,12 @@ class Backend:
         if settings.kind == "imu" and stretch is None:
             return []
         if a is None:
-            b, delta = self._growth.start(stamp, self._inertial.level() if self._inertial else None)
+            b, delta = self._start(stamp)
         else:
             b, delta = self._growth.follow(a, stamp), Delta()
-        motion = [Offer("", Measurement(stamp, driver), motion=True)]
-        delta += SENSORS[settings.kind].factors(
+        mover, kind = (NAME, "odometry") if self._coaster else (driver, settings.kind)
+        motion = [Offer("", Measurement(stamp, mover), motion=True)]
+        delta += SENSORS[kind].factors(
             motion, a, b, self.calibration.context(self._context({}), driver), settings
         )
         if settings.kind == "imu" and stretch is not None:
@@ -429,6 +458,14 @@ class Backend:
         updates = self._update(b, delta, [b], window)
         self._begun(b, stretch)
         return updates
+
+    def _start(self, stamp: int) -> tuple[Keyframe, Delta]:
+        """The first keyframe, turned as far as anything tells."""
+        if self._coaster:
+            return self._growth.start(stamp, self.track.pose(stamp))
+        if self._inertial:
+            return self._growth.start(stamp, self._inertial.level(), TILT)
+        return self._growth.start(stamp)
 
     def _edges_beside(self) -> tuple[Factor, ...]:
         """By the odometries that do not drive."""
@@ -521,7 +558,7 @@ class Backend:
             self.landmark,
             self.parts.of,
             self._waiting.for_variable,
-            self.config.earth,
+            self._earth,
             self.origin,
             self._gauge,
             DATUM in self.solver.factors,
@@ -582,7 +619,7 @@ class Backend:
         self, b: Keyframe, delta: Delta, new: Sequence[Keyframe], window: Sequence[Offer]
     ) -> list[Update]:
         """Solve: motion and all that nothing judges first, then what the robust stages let in."""
-        delta += Delta(tuple(priors(self.config.floor, new)))
+        delta += Delta(tuple(priors(self._floor, new)))
         self._decisions += delta.decisions
         self._decisions += [told for each in delta.waits for told in self._waiting.wait(each)]
         window = [*window, *self._waiting.landed(delta.values, {factor.id for factor in delta.add})]
@@ -636,7 +673,7 @@ class Backend:
             settings = self.config.sources[name]
             context = self.calibration.context(self._context({}), name, constants, anchor)
             make, last = SENSORS[settings.kind].factors, self.timeline.keyframes[-1]
-            if name == self._driver:
+            if name == self._driver and not self._coaster:
                 deltas = [make([offer], a, b, context, settings) for offer, a, b in self._steps(name)]
             else:
                 landed = [offer for offer in self.calibration.offers(name) if offer.id in self.solver.factors]

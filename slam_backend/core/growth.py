@@ -38,10 +38,13 @@ class Growth:
         self._space, self._timeline, self._track, self._parts = space, timeline, track, parts
         self.begins = 0  # the newest stamp of earlier sessions, whose keyframes are complete
 
-    def start(self, stamp: int, level: Pose | None = None) -> tuple[Keyframe, Delta]:
-        """A part of its own: its first pose is the origin, until something absolute says otherwise. level: as gravity turns it."""
-        first, origin = self._added(stamp), self._space.identity if level is None else level
-        tilt = GAUGE_SIGMA if level is None else TILT
+    def start(
+        self, stamp: int, origin: Pose | None = None, tilt: float = GAUGE_SIGMA
+    ) -> tuple[Keyframe, Delta]:
+        """A part of its own: its first pose is the origin, until something absolute says otherwise. origin: as gravity or a course
+        turns it. tilt: as in `gauge`.
+        """
+        first, origin = self._added(stamp), self._space.identity if origin is None else origin
         factor = gauge(self._space, first.pose, stamp, origin, tilt)
         self._parts.begin(first.pose, factor.id)
         return first, Delta((factor,), values={first.pose: origin})

@@ -381,9 +381,15 @@ def imu_of(config: Config) -> ImuSource | None:
 
 
 def pace_from(config: Config) -> Keyframes:
-    """When keyframes are due: where the IMU drives, after some time at the latest."""
+    """When keyframes are due: where no odometry drives, after some time at the latest. Neither an IMU nor constant velocity knows
+    enough of how fast the robot is to tell by the distance.
+    """
     driver = config.sources[config.driver or ""]
-    if not isinstance(driver, ImuSource):
+    if isinstance(driver, ImuSource):
+        longest = driver.keyframe_time
+    elif driver.kind in ("gnss", "pose"):
+        longest = config.coast.keyframe_time
+    else:
         return config.keyframes
-    longest = min(driver.keyframe_time, config.keyframes.time or driver.keyframe_time)
+    longest = min(longest, config.keyframes.time or longest)
     return config.keyframes.model_copy(update={"time": longest})

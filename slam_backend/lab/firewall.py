@@ -14,7 +14,7 @@ lost or weakened; **error**: the source is of no use until it is mended. What a 
 where a setting is named, the threshold is that setting's default.
 
 Nothing is judged that the configuration does not use: in the plane only x, y and yaw; of an odometry's covariances only the one that `noise`
-names. A covariance of all zeros means the configured default. The **driving source** (the first odometry, else the IMU, else the first relative source) is
+names. A covariance of all zeros means the configured default. The **driving source** (the first odometry, else the IMU, else the first relative source, else the first GNSS or absolute pose) is
 protected: no other source moves the watermark, and of a flood the oldest messages of the flooding source are dropped, never those of the driving one.
 """
 STAGES = {
@@ -24,6 +24,7 @@ STAGES = {
     "recheck": "Odometry, in order of stamps",
     "wait": "While waiting for a keyframe",
     "imu": "From one keyframe to the next, by the IMU",
+    "coast": "Where nothing measures the motion",
     "*": "Where it lands",
     "gnss": "Fixes on the earth",
     "doubt": "Fixes beside what is expected of them",

@@ -88,6 +88,9 @@ def test_a_parameter_file_of_the_node_is_taken_as_well():
         (["relative", "odometry", "odometry"], "s1"),
         (["landmark", "relative", "relative"], "s1"),
         (["odometry"], "s0"),
+        (["gnss", "relative"], "s1"),
+        (["landmark", "pose", "gnss"], "s2"),
+        (["landmark", "pose"], "s1"),
     ],
 )
 def test_the_first_odometry_drives_else_the_first_relative(kinds, driver):
@@ -96,7 +99,7 @@ def test_the_first_odometry_drives_else_the_first_relative(kinds, driver):
 
 
 def test_sources_without_a_driver_are_refused():
-    assert "add one of kind odometry, imu or relative" in complaint(
+    assert "add one of kind odometry, imu, relative, gnss or pose" in complaint(
         {"sources": ["a"], "a": {"kind": "landmark"}}
     )
 

@@ -67,7 +67,7 @@ def test_a_parameter_file_of_the_node_is_taken_as_well(yaml):
         ("space: 4d", ["space", "'2d' or '3d'", "4d"]),
         ("sources: [wheels]", ["'wheels' is listed in 'sources' but not described"]),
         ("sources: [a@b]\na@b: {kind: odometry}", ["a@b"]),
-        (GOOD.replace("odometry", "pose"), ["no source drives the keyframes"]),
+        (GOOD.replace("odometry", "landmark"), ["no source drives the keyframes"]),
         ("- a\n- list\n", ["holds no settings (a list or a plain value"]),
         ("just words", ["holds no settings"]),
         ("extrinsics: {camera: [0, 0, 1]}", ["extrinsics.camera"]),

@@ -194,6 +194,20 @@ def test_kitti_has_an_imu_and_fixes_and_its_configuration_finds_yaw_and_speed(tm
     assert away.max() < 0.3
 
 
+def test_the_fixes_of_kitti_alone_make_a_path_near_those_kept_back(tmp_path: Path) -> None:
+    """A fix each second, at up to 14 m/s; every tenth is a truth."""
+    path = make_dataset("kitti_imu_gnss", tmp_path / "kitti.mcap").path
+    gps = {"kind": "gnss", "topic": "/fix", "withhold_every": 10}
+    run = replay(path, config_from({"space": "2d", "sources": ["gps"], "gps": gps}))
+    for _ in run:
+        pass
+    found = run.backend.compared(run.backend.snapshot())
+    away = np.linalg.norm((found.antennas - found.fixes)[:, :2], axis=1)
+    assert found.withheld.sum() == 47
+    assert np.sqrt(np.mean(away[~found.withheld] ** 2)) < 0.2
+    assert np.nanmedian(away[found.withheld]) < 1.0
+
+
 def test_kitti_stereo_has_every_sighting_and_the_right_cameras_baseline(tmp_path: Path) -> None:
     """52544 of 15638 features in 77 images, as the text has them: u left, u right, v."""
     path = make_dataset("kitti_stereo", tmp_path / "stereo.mcap").path

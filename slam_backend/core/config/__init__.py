@@ -8,7 +8,7 @@ In YAML the sources are named in a list and described at the top level, so that 
     trees: {kind: landmark, topic: /trees, kernel: cauchy}
 """
 
-from .estimation import Budget, Earth, Floor, Isam2, Keyframes, Quarantine, Settle
+from .estimation import Budget, Coast, Earth, Floor, Isam2, Keyframes, Quarantine, Settle
 from .node import Journaling, PathOutput
 from .reading import config_from, config_hash, config_to, words_of
 from .section import LIVE, Section
@@ -38,6 +38,7 @@ __all__ = [
     "AnySource",
     "Budget",
     "Camera",
+    "Coast",
     "Config",
     "Earth",
     "Floor",

@@ -67,6 +67,27 @@ class Floor(Section):
     )
 
 
+class Coast(Section):
+    """Motion where no odometry and no IMU tells it: fixes, or absolute poses, and constant velocity between them."""
+
+    acceleration: float = Field(
+        1.0,
+        gt=0,
+        le=1e6,
+        description="m/s^2 in 1 s, white: how far constant velocity is believed; less where a robot is slow and calm",
+    )
+    turn_rate: float = Field(0.5, gt=0, le=1e6, description="rad/s in 1 s, white: how the robot may turn")
+    tilt: float = Field(
+        0.2, gt=0, le=3.2, description="rad of roll and pitch, each way (3d), unless floor.tilt says it"
+    )
+    max_speed: float = Field(
+        50.0, gt=0, le=1e4, description="m/s: positions farther apart than that cannot both be right"
+    )
+    keyframe_time: float = Field(
+        1.0, gt=0, le=3600, description="seconds between keyframes at most, as far as there are positions"
+    )
+
+
 class Quarantine(Section):
     """Landmarks that moved, move, or exist twice are taken out, by the history of their residuals."""
 

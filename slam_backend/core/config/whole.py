@@ -5,7 +5,7 @@ from typing import Literal
 
 from pydantic import Field, model_validator
 
-from .estimation import Budget, Earth, Floor, Isam2, Keyframes, Quarantine, Settle
+from .estimation import Budget, Coast, Earth, Floor, Isam2, Keyframes, Quarantine, Settle
 from .node import Journaling, PathOutput
 from .section import Section
 from .sources import AnySource
@@ -45,6 +45,7 @@ class Config(Section):
     )
     journal: Journaling = Journaling()
     floor: Floor = Floor()
+    coast: Coast = Coast()
     quarantine: Quarantine = Quarantine()
     budget: Budget = Budget()
     path: PathOutput = PathOutput()
@@ -76,7 +77,9 @@ class Config(Section):
                 f"source '{flat[0]}': pixels need space 3d: where a feature is seen depends on height, roll and pitch"
             )
         if self.sources and self.driver is None:
-            raise ValueError("no source drives the keyframes: add one of kind odometry, imu or relative")
+            raise ValueError(
+                "no source drives the keyframes: add one of kind odometry, imu, relative, gnss or pose"
+            )
         imus = [name for name, source in self.sources.items() if source.kind == "imu"]
         if imus and self.space == "2d":
             raise ValueError(
@@ -89,8 +92,10 @@ class Config(Section):
 
     @property
     def driver(self) -> str | None:
-        """The source that drives the keyframes: the first odometry, else the IMU, else the first relative."""
-        for kind in ("odometry", "imu", "relative"):
+        """The source that drives the keyframes: the first odometry, else the IMU, else the first relative; where none of these
+        tells motion, the first GNSS, else the first absolute pose.
+        """
+        for kind in ("odometry", "imu", "relative", "gnss", "pose"):
             for name, source in self.sources.items():
                 if source.kind == kind:
                     return name

@@ -140,6 +140,16 @@ RULES: Mapping[str, Rule] = {
         "note", "the robot moves at first: velocity and bias come from other sensors", "standing still for a second tells more", unit="s",
         setting="<imu>.start",
     ),
+    # -- nothing measures the motion -----------------------------------------------------------------------------
+    "coast/no_heading": Rule(
+        "note", "the robot does not move yet, so nothing tells where it looks: any heading is possible",
+        "nothing: the first metres tell; an IMU or odometry would say more",
+    ),
+    "coast/restart": Rule(
+        "warn", "positions in a row fit each other and not the motion before: constant velocity begins anew",
+        "look for reflections and a receiver that starts up; if the robot moves so, raise coast.acceleration",
+        None, "standard deviations", "coast.acceleration",
+    ),
     # -- covariances: only the block that the space uses ---------------------------------------------------------
     "check/zero_covariance": Rule(
         "warn", "a variance of zero takes the configured default", "state a variance, or set the sigmas of the source", 0.0

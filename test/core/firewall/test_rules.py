@@ -19,7 +19,7 @@ SOURCE = "\n".join(
 
 def named() -> set[str]:
     """Ids as they stand in the code that judges."""
-    found = set(re.findall(r'"((?:check|settle|recheck|wait|imu|gnss)/[a-z_]+)"', SOURCE))
+    found = set(re.findall(r'"((?:check|settle|recheck|wait|imu|gnss|coast)/[a-z_]+)"', SOURCE))
     found |= {f"check/{reason}" for reason in re.findall(r'Fault\(\s*"([a-z_]+)"', SOURCE)}
     for what in re.findall(r'Fault\(\s*f"\{what\}_([a-z_]+)"', SOURCE):
         found |= {f"check/covariance_{what}", f"check/information_{what}"}
