@@ -116,7 +116,7 @@ class Budget:
                 change += Delta((whole,), tuple(f.id for f in group))
                 why = f"stands for {len(group)} sightings from its keyframe"
                 of = [f.id for f in group]
-                decisions.append(_told(whole, "accepted", "combined", why, of=of, chi2=chi2))
+                decisions.append(_told(whole, "accepted", "sum", why, of=of, chi2=chi2))
                 decisions += [_told(f, "removed", "combined", f"in {whole.id}") for f in group]
         return change, tuple(decisions)
 

@@ -14,6 +14,7 @@ from slam_backend.core.config import Config, config_from
 from slam_backend.core.errors import SlamError
 from slam_backend.core.fingerprint import run_hash
 from slam_backend.core.graph import Decision, Delta, Factor, keyframe, landmark_key
+from slam_backend.core.measurement import SECOND
 from slam_backend.core.space import SPACES
 from slam_backend.lab.options import Options
 from slam_backend.lab.simulate import Simulation, simulate
@@ -151,9 +152,7 @@ def test_sightings_from_one_keyframe_become_one_that_says_the_same(space, whole)
     (one,) = change.add
     assert change.remove == tuple(factors)[:3]
     assert one.id == "trees/2.000000000/0:3"
-    assert [(d.verdict, d.reason) for d in decisions] == [("accepted", "combined")] + [
-        ("removed", "combined")
-    ] * 3
+    assert [(d.verdict, d.reason) for d in decisions] == [("accepted", "sum")] + [("removed", "combined")] * 3
     for _ in range(10):
         values = gtsam.Values()
         values.insert(pose, kind.expmap(rng.normal(0, 0.003, kind.dimension)))
@@ -193,6 +192,21 @@ def test_the_budget_holds_in_space_too() -> None:
     assert max(per_landmark(backend).values()) <= MOST
 
 
+@pytest.mark.parametrize("before", [0, MOST])
+def test_a_map_that_is_continued_comes_under_the_budget(drive, before) -> None:
+    """One that was made without a budget, and one that has sums already."""
+    few = {"distance": 3.0, "angle": 1.0}
+    first, _ = ran(drive, before, keyframes=few)
+    online = first.snapshot().trajectory
+    backend = Backend(config_from({**drive.settings, "keyframes": few, "budget": {"sightings": MOST}}))
+    backend.load(first.saved(online))
+    for m in drive.measurements:
+        backend.add(replace(m, stamp=m.stamp + 1000 * SECOND))
+    backend.finish()
+    assert len(backend.snapshot().trajectory.stamps) > len(online.stamps)
+    assert max(per_landmark(backend).values()) <= MOST
+
+
 # -- what a person has decided -----------------------------------------------------------------------
 
 
@@ -201,9 +215,9 @@ def edited(backend: Backend, action: str = "edit", **arguments) -> Decision:
     return backend.add(command("1", action, arguments))[-1].decisions[-1]
 
 
-def test_what_a_person_has_named_stays_as_it_is(drive) -> None:
+def test_what_a_person_has_named_stays_as_it_is(drive, thin) -> None:
     """Reweighted early, it is in the graph at the end."""
-    backend, early = half_way(drive)
+    backend, early = half_way(drive, thin[1])
     assert edited(backend, reweight={early: 0.5}).verdict == "accepted"
     finished(drive, backend)
     assert early in backend.solver.factors
@@ -215,7 +229,7 @@ def test_an_edit_of_what_is_gone_is_refused_in_one_line(drive, thin) -> None:
     gone = next(d.id for d in decisions if d.stage == "budget")
     with pytest.raises(SlamError, match=f"there is no factor '{gone}'; what became of its message"):
         backend.dry_run("edit", {"disable": [gone]})
-    backend, early = half_way(drive)
+    backend, early = half_way(drive, decisions)
     edited(backend, reweight={early: 0.5})
     edited(backend, "undo")
     assert early not in finished(drive, backend)
@@ -225,12 +239,11 @@ def test_an_edit_of_what_is_gone_is_refused_in_one_line(drive, thin) -> None:
         backend.dry_run("edit", {"enable": [early]})
 
 
-def half_way(drive: Simulation) -> tuple[Backend, str]:
-    """Before any budget is reached; and a sighting that it will cost."""
+def half_way(drive: Simulation, decisions: list[Decision]) -> tuple[Backend, str]:
+    """Before any budget is reached; and a sighting that it will cost. decisions: of the whole drive."""
     backend = Backend(config_from({**drive.settings, "budget": {"sightings": MOST}}))
     for m in list(drive.measurements)[:EARLY]:
         backend.add(m)
-    _, decisions = ran(drive)
     gone = [d.id for d in decisions if d.stage == "budget"]
     return backend, next(id_ for id_ in gone if id_ in backend.solver.factors)
 
