@@ -26,6 +26,7 @@ from ..core.sensors.pixels import PixelFrame
 from ..core.sensors.relative import RelativePose
 from ..core.space import SPACES
 from .discover import discover, is_truth
+from .gravity import sideways
 from .inputs import OWN, TF_STATIC, BagInputs, GraphInput, open_inputs
 from .replay import settled_stream
 
@@ -110,6 +111,8 @@ def examine(paths: Sequence[Path | str], config: Config | None = None) -> Checku
         log_times = _log_times(inputs)
         topics = [_topic(name, type_, inputs, watch, log_times) for name, type_ in _names(inputs, config)]
         _compare_clocks(topics, watch, log_times)
+        if isinstance(inputs, BagInputs):
+            _compare_gravity(topics, inputs, watch)
     findings += [
         Finding("error", line, "copy or record it again; what could be read is judged here")
         for line in inputs.damage
@@ -135,10 +138,11 @@ class _Watch:
         self.noted: dict[str, Counter[str]] = defaultdict(Counter)
         self.unmounted: dict[str, Counter[str]] = defaultdict(Counter)  # source -> frame -> how often
         self._frames: dict[str, Counter[str]] = defaultdict(Counter)
+        self.mounts = Mounts(SPACES["3d"], "", {})
 
     def follow(self, inputs: BagInputs | GraphInput, config: Config) -> None:
         """Everything of the input, to its end."""
-        mounts = Mounts(SPACES[config.space], config.base_frame, config.extrinsics)
+        self.mounts = mounts = Mounts(SPACES[config.space], config.base_frame, config.extrinsics)
         for item in settled_stream(self._seen(inputs.stream(config)), config):
             if isinstance(item, Decision):
                 counts = self.refused if item.verdict == "refused" else self.noted
@@ -267,6 +271,15 @@ def _unused(name: str, type_: str) -> str:
     if is_truth(name):
         return "taken for ground truth and left aside"
     return f"not used; could be {' or '.join(kinds)}"
+
+
+def _compare_gravity(topics: Sequence[Topic], inputs: BagInputs, watch: _Watch) -> None:
+    """IMUs by which the robot would lie on its side, used or not."""
+    tilts, rule = sideways(inputs, watch.mounts), RULES["imu/sideways"]
+    for topic in topics:
+        if topic.name in tilts:
+            what = f"imu/sideways: {rule.what} (tilted by {tilts[topic.name]:.1f} rad)"
+            topic.findings.append(Finding(rule.severity, what, rule.advice))
 
 
 def _compare_clocks(topics: Sequence[Topic], watch: _Watch, log_times: dict[str, "array[int]"]) -> None:

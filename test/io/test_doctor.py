@@ -9,9 +9,10 @@ from slam_backend.core.config import config_from
 from slam_backend.core.measurement import SECOND
 from slam_backend.io.bags import open_bag, write_bag
 from slam_backend.io.doctor import Checkup, examine, worst
-from slam_backend.io.encode import encode_odometry, encode_string
+from slam_backend.io.encode import encode_odometry, encode_string, encode_transforms
 from slam_backend.io.qos import offered_qos
 from slam_backend.io.records import Record
+from slam_backend.io.typestore import typestore_of
 
 DATA = Path(__file__).parents[2] / "../shared/data/bags"
 ZERO = np.zeros((6, 6))
@@ -161,3 +162,43 @@ def test_real_recordings_get_a_true_verdict(name):
             name: topic.count for name, topic in bag.topics.items()
         }
     assert not any(topic.refused for topic in found.topics)
+
+
+STORE = typestore_of(())
+
+
+def imu(n: int, acceleration) -> Record:
+    vector, header = STORE.types["geometry_msgs/msg/Vector3"], STORE.types["std_msgs/msg/Header"]
+    time, turn = STORE.types["builtin_interfaces/msg/Time"], STORE.types["geometry_msgs/msg/Quaternion"]
+    message = STORE.types["sensor_msgs/msg/Imu"](
+        header(time(1, n * 10_000_000), "imu_link"), turn(0.0, 0.0, 0.0, 1.0), np.zeros(9),
+        vector(0.0, 0.0, 0.0), np.zeros(9), vector(*acceleration), np.zeros(9),
+    )  # fmt: skip
+    data = bytes(STORE.serialize_cdr(message, "sensor_msgs/msg/Imu"))
+    return Record("/imu", "sensor_msgs/msg/Imu", SECOND + n * SECOND // 100, data)
+
+
+def mounting(seven) -> Record:
+    return Record(
+        "/tf_static", "tf2_msgs/msg/TFMessage", SECOND,
+        encode_transforms(SECOND, "base_link", {"imu_link": seven}),
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("others", [[], [odometry(n) for n in range(20)]], ids=["alone", "with odometry"])
+@pytest.mark.parametrize(
+    ("acceleration", "odd"),
+    [((0.1, 0.2, 9.8), False), ((-9.8, 0.2, 0.1), True), ((0.1, 0.0, -9.8), True), ((0.3, 0.1, 0.0), False)],
+    ids=["upright", "on its side", "upside down", "gravity taken out"],
+)
+def test_an_imu_that_lies_on_its_side_is_said_without_a_configuration(tmp_path, acceleration, odd, others):
+    found = checked(tmp_path, [*(imu(n, acceleration) for n in range(50)), *others])
+    (topic,) = (topic for topic in found.topics if topic.name == "/imu")
+    assert any("imu/sideways" in finding.what for finding in topic.findings) == odd
+
+
+def test_an_imu_whose_mounting_is_told_may_lie_as_it_wants(tmp_path):
+    half = np.sqrt(0.5)
+    told = mounting((0.0, 0.0, 0.0, 0.0, half, 0.0, half))  # its x axis points down
+    found = checked(tmp_path, [told, *(imu(n, (-9.8, 0.2, 0.1)) for n in range(50))])
+    assert not any("imu/sideways" in finding.what for topic in found.topics for finding in topic.findings)
