@@ -38,6 +38,7 @@ from .graph import (
     Pose,
     identify,
     landmark_key,
+    tag_key,
     total,
 )
 from .growth import TILT, Growth
@@ -63,7 +64,7 @@ from .settle import FAR
 from .solvers import SOLVERS, Solver
 from .space import SPACES
 from .trajectory import Snapshot, States, Trajectory
-from .variables import moved, value_in
+from .variables import is_posed, moved, value_in
 from .waiting import Waiting, refusal
 
 STEP = SECOND // 20  # ns between samples of the track where the IMU drives
@@ -291,8 +292,14 @@ class Backend:
         values = self._applier.estimate.values() if self._applier.estimate else gtsam.Values()
         sevens = self.space.sevens(values, [k.pose for k in keyframes])
         points = np.zeros((len(names), 3))
+        orientations: dict[str, Array] = {}
         for row, name in zip(points, names, strict=True):
-            row[: self.space.point_dimension] = self.space.point_in(values, self._landmarks[name])
+            value = value_in(self.space, values, key := self._landmarks[name])
+            if is_posed(key):
+                seven = np.array(self.space.seven(value))
+                row[:], orientations[name] = seven[:3], seven[3:]
+            else:
+                row[: self.space.point_dimension] = value
         rows = {each.stamp: row for row, each in enumerate(keyframes)}
         sessions = [(track, rows[first.stamp]) for track, first in self.tracks.starts(keyframes)]
         odometry = joined(
@@ -307,6 +314,7 @@ class Backend:
             points,
             self._revision,
             self._states(values, keyframes) if self._imu else States(),
+            orientations,
         )
 
     def _states(self, values: gtsam.Values, keyframes: Sequence[Keyframe]) -> States:
@@ -567,6 +575,7 @@ class Backend:
             kept=self.solver.factors.__contains__,
             cameras=self._cameras,
             memory=self._memory,
+            tag=self._tag,
         )
 
     def _takes(self, fix: Fix) -> bool:
@@ -584,6 +593,9 @@ class Backend:
     def landmark(self, name: str) -> int:
         """The key of a landmark by its name; a new name gets a new key."""
         return self._landmarks.setdefault(name, landmark_key(len(self._landmarks)))
+
+    def _tag(self, name: str) -> int:
+        return self._landmarks.setdefault(name, tag_key(len(self._landmarks)))
 
     def _carry_out(self, command: Command) -> list[Update]:
         """What a person asks; what came of it is a decision, told with the newest keyframe."""

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from .config import Earth
-from .graph import Decision, Delta, Estimate, Factor, Motion, Offer, Pose, Wait
+from .graph import UNTIL_JOINED, Decision, Delta, Estimate, Factor, Motion, Offer, Pose, Wait
 from .inertial import Stretch
 from .keyframes import Placed
 from .measurement import Array
@@ -37,7 +37,7 @@ class Context:
     guesses: first guesses of the variables of this change, which the estimate does not know yet.
     place: stamp -> nearest keyframe and the motion to the stamp; None where no odometry covers it.
     motion: (start, end) -> `start_T_end` by the driving source.
-    landmark: name -> key. component: key -> number of its connected component (None: not in the graph).
+    landmark: name -> key. tag: the same, for one that is seen with its orientation; a name keeps its first key. component: key -> number of its connected component (None: not in the graph).
     waiting: key -> the measurements that wait for that variable.
     origin: latitude, longitude, altitude; None before the first fix.
     gauge: key -> id of the factor that holds its component and may be replaced; None where something else holds it, or will.
@@ -66,6 +66,7 @@ class Context:
     kept: Callable[[str], bool] = lambda _: False
     cameras: Mapping[str, Any] = field(default_factory=dict)
     memory: dict[str, Any] = field(default_factory=dict)
+    tag: Callable[[str], int] = lambda _: UNTIL_JOINED  # a graph file has none
 
     def known(self, key: int) -> bool:
         """Whether a variable is in the graph, or about to enter."""

@@ -37,6 +37,10 @@ def landmark_key(index: int) -> int:
     return int(L(index))
 
 
+def tag_key(index: int) -> int:
+    return int(gtsam.symbol("t", index))
+
+
 def is_pose(key: int) -> bool:
     return key >> 56 == ord("x")  # gtsam keeps a symbol's letter in the top byte
 
@@ -92,7 +96,7 @@ class Seen:
 
     pose: int
     landmark: int
-    point: Array
+    point: Array | Pose  # of a tag its pose
 
 
 @dataclass(frozen=True, slots=True)

@@ -28,6 +28,7 @@ Reason = Literal["moved", "duplicate", "moving"]
 REMEMBERED = 30  # sightings of a landmark that are looked at
 USUAL = 300  # residuals, of all landmarks, that say what is usual
 TIGHT = 4.0  # standard deviations of a sighting within which nine of ten sightings of one place lie
+TAGS = (gtsam.BetweenFactorPose2, gtsam.BetweenFactorPose3)
 
 
 @dataclass(slots=True, eq=False)
@@ -66,7 +67,9 @@ class Quarantine:
 
     def book(self, delta: Delta) -> None:
         """What the solver has taken."""
-        self._fresh += [f for f in delta.add if f.kind == "landmark" and isinstance(f.factor, PLACED)]
+        self._fresh += [
+            f for f in delta.add if f.kind == "landmark" and isinstance(f.factor, (*PLACED, *TAGS))
+        ]
 
     def let_in(
         self, offers: Sequence[Offer], key_of: Mapping[str, int]
@@ -153,11 +156,15 @@ class Quarantine:
         return max(1.0, float(np.median(self._residuals)) / usual)
 
     def _residual(self, factor: Factor, estimate: Estimate) -> float:
-        pose, point = factor.keys
+        """Chi-square; of a tag that of its position alone."""
         values = gtsam.Values()
-        values.insert(pose, estimate.pose(pose))
-        values.insert(point, estimate.point(point))
+        for key in factor.keys:
+            values.insert(key, estimate.value(key))
         noise: Any = without_kernel(factor.factor.noiseModel())
+        if isinstance(factor.factor, TAGS):
+            place = self._space.translation
+            off = factor.factor.unwhitenedError(values)[place]
+            return float(off @ np.linalg.solve(noise.covariance()[place, place], off))
         return float(np.sum(noise.whiten(factor.factor.unwhitenedError(values)) ** 2))
 
     # -- places ----------------------------------------------------------------------------------
@@ -189,6 +196,8 @@ class Quarantine:
 
     def _place(self, factor: Factor, estimate: Estimate) -> Array:
         seen = factor.factor.measured()
+        if isinstance(factor.factor, TAGS):
+            return np.asarray(estimate.pose(factor.keys[0]).transformFrom(seen.translation()))
         direction = seen.bearing()
         ahead = (
             direction.point3() if hasattr(direction, "point3") else np.array([direction.c(), direction.s()])
@@ -198,6 +207,8 @@ class Quarantine:
     def _sigma(self, factor: Factor) -> float:
         """Of the position that a sighting states: its bearing acts across, at its range."""
         sigmas = np.sqrt(np.diag(without_kernel(factor.factor.noiseModel()).covariance()))
+        if isinstance(factor.factor, TAGS):
+            return float(sigmas[self._space.translation].max())
         return float(np.hypot(sigmas[-1], sigmas[:-1].max() * factor.factor.measured().range()))
 
 

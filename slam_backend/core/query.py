@@ -5,7 +5,7 @@
     between@<a>,<b>     a_T_b: x y z qx qy qz qw
     velocity@<t>        x y z in the map, m/s: of a run with an IMU, linearly between keyframes
     bias@<t>            of the IMU, in its frame: accelerometer x y z (m/s^2), gyroscope x y z (rad/s)
-    landmark/<id>       x y z in the map
+    landmark/<id>       x y z in the map; of a tag with an orientation also qx qy qz qw
     decision/<factor>   the last decision about it
     map@<t>/<name>      any of these, as believed when everything up to t had been applied, and nothing later
 
@@ -58,6 +58,9 @@ class Known(Protocol):
 
     @property
     def landmarks(self) -> Mapping[str, Array]: ...
+
+    @property
+    def orientations(self) -> Mapping[str, Array]: ...
 
     @property
     def states(self) -> States: ...
@@ -249,7 +252,7 @@ def _value(asked: Question, known: Known, poses: Sequence[Posed]) -> Array | Map
     if asked.kind == "landmark":
         if (point := known.landmarks.get(asked.identifier)) is None:
             raise Unknown(f"there is no landmark '{asked.identifier}' among {len(known.landmarks)}")
-        return point
+        return np.append(point, known.orientations.get(asked.identifier, ()))
     if (decision := known.decision(asked.identifier)) is None:
         raise Unknown(f"nothing was decided about '{asked.identifier}' (ids are <source>/<sec>.<nsec>/<n>)")
     return decision

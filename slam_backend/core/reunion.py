@@ -1,6 +1,6 @@
 """Two parts of the graph that see the same landmarks: how they lie to each other, once enough of these are in both.
 
-The rigid motion between two sets of points is that of least squares (Umeyama, PAMI 1991, without scale). One landmark more is asked
+One tag, whose orientation is known, is enough. Of points, the rigid motion between two sets is that of least squares (Umeyama, PAMI 1991, without scale). One landmark more is asked
 for than determine it, so that the two constellations can contradict; the worst is left out while they do.
 """
 
@@ -37,8 +37,11 @@ def reunion(
         if wait.seen is None:
             continue
         part, to = part_of(wait.seen.pose), part_of(wait.seen.landmark)
-        if part is not None and to is not None and part != to:
-            by_parts.setdefault((part, to), {})[wait.seen.landmark] = (wait, wait.seen)
+        if part is None or to is None or part == to:
+            continue
+        if not isinstance(wait.seen.point, np.ndarray):
+            return Reunion(part, to, _carried(wait.seen, estimate), (wait,))
+        by_parts.setdefault((part, to), {})[wait.seen.landmark] = (wait, wait.seen)
     for (part, to), found in by_parts.items():
         if len(found) <= space.point_dimension:
             continue
@@ -50,6 +53,12 @@ def reunion(
             each = [wait for wait, _ in found.values()]
             return Reunion(part, to, shift, tuple(each[row] for row in rows))
     return None
+
+
+def _carried(seen: Seen, estimate: Estimate) -> Pose:
+    """By which a part moves, so that a tag that it sees lies where the other part has it."""
+    here = estimate.pose(seen.pose).compose(seen.point)
+    return estimate.pose(seen.landmark).compose(here.inverse())
 
 
 def _agreed(space: Space, here: Array, there: Array) -> tuple[Pose, Sequence[int]] | None:

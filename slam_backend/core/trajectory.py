@@ -1,5 +1,6 @@
 """Poses at any stamp, and the state of the back-end as plain arrays."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -214,6 +215,7 @@ class Snapshot:
 
     trajectory: every keyframe in order of stamp. indices: (N,) their indices. odometry: what odometry alone says, from
     the same start, at every sample that is kept. landmarks: (L, 3) in map, with `names`; revision: see Backend. states: by an IMU.
+    orientations: of the landmarks that have one, (4,) qx qy qz qw in map, by name.
     """
 
     trajectory: Trajectory
@@ -223,6 +225,7 @@ class Snapshot:
     landmarks: Array
     revision: int
     states: States = field(default_factory=States)
+    orientations: Mapping[str, Array] = field(default_factory=dict)
 
     @property
     def stamps(self) -> Stamps:

@@ -13,12 +13,15 @@ from .result import Result
 
 
 def pose_graph(result: Result) -> PoseGraph:
-    """The kept factors at the final estimate. Left out: gauges, kernels, and bearings without range, which no format has."""
+    """The kept factors at the final estimate. Left out: gauges, kernels, bearings without range, which no
+    format has, and tags with an orientation: there are no landmarks of that kind in any.
+    """
     backend, space = result.run.backend, result.run.backend.space
     keyframes = sorted(backend.timeline.keyframes, key=lambda k: k.index)
     ids = [_id(result, k.stamp, k.index) for k in keyframes]
     rank = {keyframes[n].pose: r for r, n in enumerate(np.argsort(ids))}
-    landmark_rank = {backend.landmark(name): n for n, name in enumerate(result.snapshot.names)}
+    points = [n for n, name in enumerate(result.snapshot.names) if name not in result.snapshot.orientations]
+    landmark_rank = {backend.landmark(result.snapshot.names[n]): rank for rank, n in enumerate(points)}
     order = np.argsort(ids)
     states = np.array([_state(space, space.pose_in(result.values, keyframes[n].pose)) for n in order])
     by_kind: dict[str, list[Factor]] = {"edges": [], "sightings": [], "priors": []}
@@ -27,7 +30,11 @@ def pose_graph(result: Result) -> PoseGraph:
             by_kind["edges"].append(factor)
         elif factor.kind == "pose":
             by_kind["priors"].append(factor)
-        elif factor.kind == "landmark" and hasattr(factor.factor.measured(), "range"):
+        elif (
+            factor.kind == "landmark"
+            and factor.keys[-1] in landmark_rank
+            and hasattr(factor.factor.measured(), "range")
+        ):
             by_kind["sightings"].append(factor)
     dimension = space.point_dimension
     return PoseGraph(
@@ -37,7 +44,7 @@ def pose_graph(result: Result) -> PoseGraph:
         Edges(*_links(by_kind["edges"], rank, rank, lambda f: _edge(space, f), space)),
         stamps=np.array([keyframes[n].stamp for n in order], dtype=np.int64),
         landmarks=np.arange(len(landmark_rank), dtype=np.uint64),
-        positions=result.snapshot.landmarks[:, :dimension],
+        positions=result.snapshot.landmarks[points, :dimension],
         sightings=Sightings(
             *_links(
                 by_kind["sightings"],

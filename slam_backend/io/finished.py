@@ -6,7 +6,7 @@ from collections.abc import Collection, Mapping
 from functools import cached_property
 from io import StringIO
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -28,12 +28,29 @@ from .inputs import open_inputs
 from .linearized import Linearized
 from .past import Past, Then
 from .replay import Final, Run, replay, settled_stream
+from .rundir import ORIENTATION
 from .states import NAME as STATES
 from .states import read_states
 
 AGAIN = "replay again"  # what to do about a run that is not whole any more
 ALIKE = 1e-6  # m and of quaternions; between replays on different machines
-TRIANGLE = np.array([[3, 4, 5], [4, 6, 7], [5, 7, 8]])  # columns of a landmark's numbers as a covariance
+TRIANGLE = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])  # of a matrix, by the numbers of its upper triangle
+
+
+class _Landmark(NamedTuple):
+    """Position (3,), quaternion (4,) or nothing, upper triangle (6,) of the position's covariance."""
+
+    position: Array
+    orientation: Array
+    triangle: Array
+
+
+def _landmark(row: list[str], turned: bool) -> _Landmark:
+    """turned: whether the file has columns for an orientation; they are empty where a landmark has none."""
+    told = np.array([word for word in row[5:9] if word] if turned else [], dtype=np.float64)
+    at = 9 if turned else 5
+    position, triangle = (np.array(words, dtype=np.float64) for words in (row[2:5], row[at : at + 6]))
+    return _Landmark(position.reshape(3), told.reshape(4 if len(told) else 0), triangle.reshape(6))
 
 
 class FinishedRun:
@@ -144,21 +161,25 @@ class FinishedRun:
     @property
     def landmarks(self) -> Mapping[str, Array]:
         """Positions (3,) in the map, by name."""
-        return {name: numbers[:3] for name, numbers in self._landmark_rows.items()}
+        return {name: row.position for name, row in self._landmark_rows.items()}
+
+    @property
+    def orientations(self) -> Mapping[str, Array]:
+        """(4,) quaternions of the tags that have one, by name."""
+        return {name: row.orientation for name, row in self._landmark_rows.items() if len(row.orientation)}
 
     @property
     def landmark_covariances(self) -> list[Array]:
         """(3, 3) of each position; NaN where it is not determined."""
-        return [numbers[TRIANGLE] for numbers in self._landmark_rows.values()]
+        return [row.triangle[TRIANGLE] for row in self._landmark_rows.values()]
 
     @cached_property
-    def _landmark_rows(self) -> Mapping[str, Array]:
-        """Position and upper triangle of its covariance, (9,), by name."""
+    def _landmark_rows(self) -> Mapping[str, "_Landmark"]:
         path = self.path / "landmarks.csv"
         reader = csv.reader(StringIO(read_text(path), newline=""))
         try:
-            next(reader)
-            found = {row[0]: np.array(row[2:11], dtype=np.float64).reshape(9) for row in reader}
+            turned = ORIENTATION[0] in next(reader)
+            found = {row[0]: _landmark(row, turned) for row in reader}
         except (csv.Error, ValueError, IndexError):
             raise BadFile(f"{path}:{reader.line_num}: is damaged: no name and position; {AGAIN}") from None
         self._counted(path.name, len(found), self._landmarks)

@@ -92,6 +92,10 @@ class Then:
     def landmarks(self) -> Mapping[str, Array]:
         return dict(zip(self.snapshot.names, self.snapshot.landmarks, strict=True))
 
+    @property
+    def orientations(self) -> Mapping[str, Array]:
+        return self.snapshot.orientations
+
     def covariance(self, index: int) -> Array:
         run = self._past.run_at(self._stamp)
         if index >= len(run.backend.timeline):

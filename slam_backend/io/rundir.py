@@ -13,6 +13,7 @@ from ..core.decisions import as_json
 from ..core.errors import BadFile, SlamError
 from ..core.graph import Decision
 from ..core.space import Space
+from ..core.variables import is_posed
 from .configfile import write_yaml
 from .earth import NAME as FIXES
 from .earth import write_fixes
@@ -32,6 +33,7 @@ from .states import write_states
 FILES = ("summary.json", "config.yaml", "trajectory.tum", "odometry.tum", "online.tum", "landmarks.csv",
          "decisions.jsonl", "graph.g2o", "linearized.npz", MAP)  # fmt: skip
 RESULT_BAG = "run.mcap"
+ORIENTATION = ("qx", "qy", "qz", "qw")  # columns of landmarks.csv, where a landmark has one
 INPUTS = "inputs"  # a folder of symbolic links
 DRAWN = ("trajectory.png", "report.html", "unguarded.tum", HISTORY, RESULT_BAG)  # by the command line
 MAYBE = (*DRAWN, FIXES, STATES)  # files that not every run has
@@ -126,9 +128,12 @@ def _write_decisions(path: Path, result: Result) -> None:
 
 
 def _write_landmarks(path: Path, result: Result) -> None:
-    """id, kind, position, upper triangle of its covariance (m^2), number of observations."""
+    """id, kind, position, upper triangle of its covariance (m^2), number of observations; and where one is a tag, between
+    position and covariance, the orientation, empty for points.
+    """
     backend, snapshot = result.run.backend, result.snapshot
     seen = Counter(factor.keys[-1] for factor in result.factors if factor.kind in ("landmark", "pixel"))
+    turned = ORIENTATION if snapshot.orientations else ()
     with path.open("w", encoding="utf-8", newline="") as file:
         out = csv.writer(file, lineterminator="\n")
         out.writerow(
@@ -138,6 +143,7 @@ def _write_landmarks(path: Path, result: Result) -> None:
                 "x",
                 "y",
                 "z",
+                *turned,
                 *(f"cov_{a}{b}" for a, b in ("xx", "xy", "xz", "yy", "yz", "zz")),
                 "observations",
             ]
@@ -145,13 +151,22 @@ def _write_landmarks(path: Path, result: Result) -> None:
         for name, point in zip(snapshot.names, snapshot.landmarks.tolist(), strict=True):
             key = backend.landmark(name)
             triangle = _covariance(result, key, backend.space)
-            out.writerow([name, "point", *(repr(v) for v in point), *(repr(v) for v in triangle), seen[key]])
+            told = snapshot.orientations.get(name)
+            quaternion = [""] * len(turned) if told is None else [repr(v) for v in told.tolist()]
+            kind = "point" if told is None else "pose"
+            out.writerow(
+                [name, kind, *(repr(v) for v in point), *quaternion, *(repr(v) for v in triangle), seen[key]]
+            )
 
 
 def _covariance(result: Result, key: int, space: Space) -> Iterable[float]:
-    full = np.zeros((3, 3))
+    full, estimate = np.zeros((3, 3)), result.run.backend.estimate
     try:
-        full[: space.point_dimension, : space.point_dimension] = result.run.backend.estimate.covariance([key])
+        found = estimate.covariance([key])
+        if is_posed(key):
+            full[:] = space.covariance_to_ros(found, estimate.pose(key))[:3, :3]
+        else:
+            full[: space.point_dimension, : space.point_dimension] = found
     except SlamError:
         full[:] = np.nan  # not determined: said, rather than a zero that looks certain
     return [float(value) for value in full[np.triu_indices(3)]]

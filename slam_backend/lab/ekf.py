@@ -25,7 +25,7 @@ from ..core.graph import Decision, Delta, Estimate, Factor, Pose, is_pose
 from ..core.measurement import Array
 from ..core.solvers import SOLVERS, Solver
 from ..core.space import Space
-from ..core.variables import value_in
+from ..core.variables import is_posed, value_in
 
 CLONES = 100  # keyframes in the state: what a filter can pay for at every step
 BATCH = 25  # so many more before the oldest are forgotten together: the covariance is copied then
@@ -187,8 +187,8 @@ class State:
         for key, value in values.items():
             span = self.columns[key]
             believed.update(key, value)
-            J[span] = value.inverse().AdjointMap() if is_pose(key) else _by_pose(space, value)
-            if not is_pose(key):
+            J[span] = value.inverse().AdjointMap() if is_posed(key) else _by_pose(space, value)
+            if not is_posed(key):
                 M[span, span] = turn  # the tangent of a point has the axes of the map
         here = next(key for key in event.keys if key in values)
         others = [key for key in event.keys if key not in values]

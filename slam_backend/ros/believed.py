@@ -59,6 +59,10 @@ class Believed:
     def landmarks(self) -> Mapping[str, Array]:
         return dict(zip(self._snapshot.names, self._snapshot.landmarks, strict=True))
 
+    @property
+    def orientations(self) -> Mapping[str, Array]:
+        return self._snapshot.orientations
+
     def covariance(self, index: int) -> Array:
         """Of a keyframe's pose as the worker believes it now, a little later than the snapshot."""
         if self._feeder is None:

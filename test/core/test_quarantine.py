@@ -83,6 +83,31 @@ def test_a_landmark_that_does_not_stand_still_is_taken_out_for_what_it_did(drive
     assert error(drive, backend) <= 1.1 * error(drive, without) + 0.005
 
 
+def test_a_tag_with_an_orientation_that_was_moved_is_taken_out_as_well(drive: Simulation) -> None:
+    """The same drive, past tags that all look east; one is carried away in between."""
+    poses = dict(zip(drive.stamps.tolist(), drive.sevens, strict=True))
+    noise = frozen(np.diag([0.05**2] * 3 + [0.02**2] * 3))
+    east = np.array([-1.0, -1.0, -1.0, 1.0])  # turns back what the robot is turned
+
+    def tags(items: Iterator[Measurement]) -> Iterator[Measurement]:
+        for m in items:
+            if isinstance(m, LandmarkObservation):
+                seen = np.concatenate([m.value, poses[m.stamp][3:] * east])
+                yield replace(m, form="pose", value=frozen(seen), covariance=noise)
+            else:
+                yield m
+
+    name = culprit(drive)
+    moved = told(drive, name, lambda n, point: point + (np.array([1.5, -1.0, 0.0]) if n >= 25 else 0.0))
+    backend, decisions = ran(drive, tags(moved))
+    removed = [d for d in decisions if d.stage == "quarantine" and d.verdict == "removed"]
+    assert {d.reason for d in removed} == {"moved"}
+    assert len({d.basis["landmark"] for d in removed}) == 1
+    assert name in backend.snapshot().orientations
+    without, _ = ran(drive, tags(told(drive, name, lambda *_: None)))
+    assert error(drive, backend) <= 1.1 * error(drive, without) + 0.005
+
+
 def test_landmarks_that_stand_still_stay_even_if_their_noise_is_larger_than_they_say(
     drive: Simulation,
 ) -> None:

@@ -32,6 +32,7 @@ class World:
     noise: OdometrySource = NOISE
     indices: Stamps = field(default_factory=lambda: np.array([0, 2, 1], dtype=np.int64))
     landmarks: Mapping[str, Array] = field(default_factory=lambda: {"tag36h11:5": np.array([1.0, 2, 3])})
+    orientations: Mapping[str, Array] = field(default_factory=dict)
     asked: list[int] = field(default_factory=list)
     states: States = field(
         default_factory=lambda: States(np.array([SECOND, 2 * SECOND]), np.arange(18.0).reshape(2, 9))
@@ -209,6 +210,8 @@ def test_what_is_not_known_is_said_and_the_others_are_answered() -> None:
     assert "landmark '5'" in unknown["landmark/5"]
     assert "loops/2.0/0" in unknown["decision/loops/2.0/0"]
     np.testing.assert_array_equal(value("landmark/tag36h11:5"), [1, 2, 3])
+    (tag,) = answers(["landmark/tag36h11:5"], World(orientations={"tag36h11:5": np.array(TURNED)}))
+    np.testing.assert_array_equal(tag.value, [1, 2, 3, *TURNED])
     assert value("decision/loops/1.000000000/0")["verdict"] == "accepted"
 
 

@@ -42,6 +42,12 @@ def sees(second, name, x, y):
     )
 
 
+def sees_tag(second, x, y):
+    """The same of a tag at 5, 1 that looks back along the way."""
+    place, noise = seven(5 - x, 1 - y, 2.5), frozen(np.eye(6) * 1e-4)
+    return LandmarkObservation(second * SECOND, "landmark", "", "tag36h11:5", "pose", place, noise)
+
+
 def loop(second, i, j, x, y=0.0, yaw=0.0):
     covariance = frozen(np.eye(6).ravel() * 1e-4)
     return RelativePose(
@@ -53,22 +59,24 @@ def pose(second, x, y, yaw):
     return AbsolutePose(second * SECOND, "pose", "", seven(x, y, yaw), frozen(np.eye(6).ravel() * 1e-4))
 
 
-def first_drive(config=CONFIG):
+def first_drive(config=CONFIG, tag=False):
     """Ten metres along the x axis of the map, past the trees."""
     backend = Backend(config)
     for n in range(11):
         for name in TREES if n in (3, 7) else ():
             backend.add(sees(n + 1, name, n, 0))
+        if tag and n == 3:
+            backend.add(sees_tag(n + 1, n, 0))
         backend.add(odometry(n + 1, n))
     backend.finish()
     backend.polish()
     return backend
 
 
-def second_drive(*more, seconds=5):
+def second_drive(*more, seconds=5, tag=False):
     """Begins 4 m along the old way; its odometry says that it starts at its own origin, turned by a right angle."""
     backend = Backend(CONFIG)
-    backend.load(first_drive().saved(NOTHING))
+    backend.load(first_drive(tag=tag).saved(NOTHING))
     told = sorted(more, key=lambda m: m.stamp)
     for n in range(seconds):
         stamp = (LATER + n) * SECOND
@@ -118,6 +126,20 @@ def test_the_first_measurement_between_them_joins_it_and_the_old_trajectory_stay
     np.testing.assert_allclose(positions(backend)[:11], [[n, 0] for n in range(11)], atol=1e-3)
     np.testing.assert_allclose(positions(backend)[11:], [[4 + n, 0] for n in range(5)], atol=1e-2)
     assert sum(factor.kind == "gauge" for factor in backend.solver.factors.values()) == 1
+
+
+def test_one_tag_that_both_have_seen_joins_them():
+    """What waited is used once, and the tag keeps its place and its heading."""
+    backend = second_drive(sees_tag(LATER + 2, 6, 0), sees_tag(LATER + 2, 6, 0), tag=True)
+    assert len(backend.parts) == 1
+    np.testing.assert_allclose(positions(backend)[:11], [[n, 0] for n in range(11)], atol=1e-3)
+    np.testing.assert_allclose(positions(backend)[11:], [[4 + n, 0] for n in range(5)], atol=1e-2)
+    assert sum(factor.kind == "gauge" for factor in backend.solver.factors.values()) == 1
+    snapshot, key = backend.snapshot(), backend.landmark("tag36h11:5")
+    assert sum(key in factor.keys for factor in backend.solver.factors.values()) == 3
+    np.testing.assert_allclose(snapshot.landmarks[snapshot.names.index("tag36h11:5")], [5, 1, 0], atol=1e-2)
+    np.testing.assert_allclose(snapshot.orientations["tag36h11:5"], seven(0, 0, 2.5)[3:], atol=1e-2)
+    assert list(snapshot.orientations) == ["tag36h11:5"]
 
 
 def test_after_the_joint_old_landmarks_are_seen_by_their_names():

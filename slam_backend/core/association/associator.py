@@ -14,7 +14,7 @@ from ..errors import SolverFailure
 from ..graph import Decision, Keyframe, Motion, Offer, Pose, Verdict
 from ..measurement import SECOND, Array
 from ..robust.chi2 import chi2_quantile
-from ..sensors.landmark import NAMELESS, LandmarkObservation, as_point, moved
+from ..sensors.landmark import NAMELESS, LandmarkObservation, as_point, moved, positioned
 from ..sensors.ranging import PLACELESS
 from ..space import Space
 from .compatibility import Pairs, Prediction, jointly, nearest
@@ -125,7 +125,7 @@ class Associator:
             m = offer.measurement
             assert isinstance(m, LandmarkObservation)
             if m.landmark == NAMELESS or (self._config.ignore_ids and not self._is_own(m.landmark)):
-                scans[m.stamp, m.frame].append(offer)
+                scans[m.stamp, m.frame].append(offer._replace(measurement=positioned(m)))
             else:
                 named.append(offer)
         regions: dict[int, list[Scan]] = defaultdict(list)

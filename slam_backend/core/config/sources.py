@@ -153,6 +153,14 @@ class LandmarkSource(Mounted):
     sigma_position: float = Field(
         0.1, gt=0, le=1e6, description="m, for positions without noise of their own"
     )
+    orientation: bool = Field(
+        default=True,
+        description="tags that are told with an orientation count with it; false: by their position alone. A small image tells the "
+        "orientation badly, and of two ways at that",
+    )
+    sigma_rotation: float = Field(
+        0.1, gt=0, le=1e6, description="rad, for the orientation of tags without noise of their own"
+    )
     sigma_range: float = Field(0.1, gt=0, le=1e6, description="m, for ranges without noise of their own")
     sigma_bearing: float = Field(
         0.02, gt=0, le=1e6, description="rad, for bearings without noise of their own"

@@ -7,7 +7,7 @@ import numpy as np
 from ..inertial import ImuSample
 from ..measurement import SECOND, Array
 from ..sensors.gnss import Fix
-from ..sensors.landmark import FORMS, LandmarkObservation, vertical
+from ..sensors.landmark import FORMS, LandmarkObservation, used_axes
 from ..space import Space
 from .rules import FARTHEST, LATEST, QUATERNION_TOLERANCE, VIOLENT, Fault
 
@@ -45,12 +45,14 @@ def judge_sighting(item: LandmarkObservation, space: Space) -> tuple[int, ...]:
         raise Fault("landmark_id")
     if item.form not in FORMS:
         raise Fault("landmark_kind")
-    keep = tuple(k for k in range(len(item.covariance)) if space.name == "3d" or k != vertical(item.form))
-    if not all(isfinite(v) and abs(v) < FARTHEST for v in item.value[list(keep)].tolist()):
+    keep = used_axes(item.form, len(item.covariance), space)
+    if item.form == "pose":
+        judge_pose(item.value, space)
+    elif not all(isfinite(v) and abs(v) < FARTHEST for v in item.value[list(keep)].tolist()):
         raise Fault("not_finite")
     if item.form in ("bearing_range", "range") and item.value[-1] <= 0:
         raise Fault("range", float(item.value[-1]))
-    if item.form == "position" and not np.any(item.value[: space.point_dimension]):
+    if item.form in ("pose", "position") and not np.any(item.value[: space.point_dimension]):
         raise Fault("range", 0.0)
     return keep
 

@@ -1,4 +1,4 @@
-"""Landmarks with known ids, seen from the robot: position, bearing and range, or one of these alone."""
+"""Landmarks with known ids, seen from the robot: pose, position, bearing and range, or one of these alone."""
 
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -16,21 +16,28 @@ from ..context import Context, Unusable, defaulted, each
 from ..errors import BadMessage
 from ..graph import UNTIL_JOINED, Delta, Factor, Keyframe, Motion, Offer, Pose, Seen, Wait
 from ..keyframes import Placed
-from ..measurement import Array, Decoder, Measurement, Message, frozen, parse_frame, stamp_of
+from ..measurement import Array, Decoder, Measurement, Message, frozen, parse_frame, seven_of, stamp_of
 from ..robust.kernels import noise_of
 from ..space import Space
+from ..variables import is_posed
 from .placing import is_due, place
 from .ranging import PLACELESS, range_factor, sighting, told
+from .tag import tag_from_keyframe, tilted
 
-Form = Literal["position", "bearing_range", "bearing", "range"]
+Form = Literal["pose", "position", "bearing_range", "bearing", "range"]
 FORMS = frozenset(get_args(Form))
 
 UNNAMED = "?"  # the frame of a sensor that its messages do not tell
 NAMELESS = "?"  # what no message calls a landmark: which one it is must be found out
-UPRIGHT = 0.5  # cosine of a sensor's tilt; below, its x and y are not those of the ground
 COUNTABLE = 2.0**53  # of double precision
 NEAREST = 1e-6  # m; nearer, a landmark has no direction
 PLACED = (gtsam.BearingRangeFactor2D, gtsam.BearingRangeFactor3D)  # one says where its landmark is
+APART = "the landmark belongs to a part of the graph that is not connected yet"
+
+QUATERNION = ("qx", "qy", "qz", "qw")
+NOISY = ("x", "y", "z", "roll", "pitch", "yaw")  # axes of the noise of a pose
+COMMON = dict.fromkeys("xyz", "sigma_position") | dict.fromkeys(NOISY[3:], "sigma_rotation")
+COMMON |= {"azimuth": "sigma_bearing", "elevation": "sigma_bearing", "range": "sigma_range"}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -38,12 +45,13 @@ class LandmarkObservation(Measurement):
     """One sighting of one landmark from `frame` (empty: the base).
 
     form      value                           covariance
+    pose      x y z qx qy qz qw               6x6 in ROS order
     position  x y z (m)                       3x3
     bearing_range  azimuth elevation range    3x3
     bearing   azimuth elevation (rad)         2x2
     range     range (m)                       1x1
     landmark: its name; NAMELESS where the message has no ids; empty where it has one that names nothing.
-    NaN on the diagonal of the covariance means: use the configured default. In 2-D z and elevation are not used.
+    NaN on the diagonal of the covariance means: use the configured default. In 2-D z and elevation are not used, nor roll and pitch.
     """
 
     frame: str
@@ -54,8 +62,9 @@ class LandmarkObservation(Measurement):
 
 
 def decode_points(message: Message, source: str) -> Iterable[LandmarkObservation]:
-    """sensor_msgs/msg/PointCloud2: one observation per point; the fields `x y [z]`, `range azimuth [elevation]`,
-    `azimuth [elevation]` or `range`, and `id` where landmarks are known apart; noise by `cov` or `sigma_*`.
+    """sensor_msgs/msg/PointCloud2: one observation per point; the fields `x y [z]`, with `qx qy qz qw` where the landmark
+    has an orientation, `range azimuth [elevation]`, `azimuth [elevation]` or `range`, and `id` where landmarks are known apart;
+    noise by `cov` or `sigma_*`.
     """
     from .cloud import columns, scalars
 
@@ -65,7 +74,9 @@ def decode_points(message: Message, source: str) -> Iterable[LandmarkObservation
     zero = np.zeros(count)
     form: Form
     axes: tuple[str, ...]
-    if "x" in table and "y" in table:
+    if "id" in table and table.keys() >= {"x", "y", *QUATERNION}:
+        form, axes = "pose", ("x", "y", "z", *QUATERNION)
+    elif "x" in table and "y" in table:
         form, axes = "position", ("x", "y", "z")
     elif "azimuth" in table and "range" in table:
         form, axes = "bearing_range", ("azimuth", "elevation", "range")
@@ -80,7 +91,7 @@ def decode_points(message: Message, source: str) -> Iterable[LandmarkObservation
     for n, name in enumerate(_names(table["id"]) if "id" in table else [NAMELESS] * count):
         yield LandmarkObservation(
             stamp, source, frame, name, form,
-            frozen(values[n]), frozen(_covariance(table, n, axes)),
+            frozen(values[n]), frozen(_covariance(table, n, NOISY if form == "pose" else axes)),
         )  # fmt: skip
 
 
@@ -103,8 +114,7 @@ def _covariance(table: dict[str, Array], n: int, axes: tuple[str, ...]) -> Array
         return given.reshape(size, size)
     sigmas = np.full(size, np.nan)
     for k, axis in enumerate(axes):
-        common = "sigma_position" if axis in "xyz" else "sigma_range" if axis == "range" else "sigma_bearing"
-        for name in (f"sigma_{axis}", common, "sigma"):
+        for name in (f"sigma_{axis}", COMMON[axis], "sigma"):
             if name in table:
                 sigmas[k] = table[name][n]
                 break
@@ -125,15 +135,12 @@ def decode_range(message: Message, source: str) -> Iterable[LandmarkObservation]
 
 
 def decode_tag(message: Message, source: str) -> LandmarkObservation:
-    """nav_msgs/msg/Odometry: one tag, named by `child_frame_id`, seen by the camera `header.frame_id`. Its position counts; its
-    orientation, which a small image tells badly and of two ways at that, does not.
-    """
+    """nav_msgs/msg/Odometry: one tag, named by `child_frame_id`, seen by the camera `header.frame_id`."""
     camera, _ = parse_frame(message.header.frame_id)
-    p = message.pose.pose.position
-    covariance = np.array(message.pose.covariance, dtype=np.float64).reshape(6, 6)[:3, :3]
+    covariance = np.array(message.pose.covariance, dtype=np.float64).reshape(6, 6)
     return LandmarkObservation(
-        stamp_of(message), source, camera, message.child_frame_id, "position",
-        frozen((p.x, p.y, p.z)), frozen(covariance),
+        stamp_of(message), source, camera, message.child_frame_id, "pose",
+        seven_of(message.pose.pose), frozen(covariance),
     )  # fmt: skip
 
 
@@ -151,12 +158,13 @@ def factors(
     context: Context,
     config: LandmarkSource,
 ) -> Delta:
-    """A bearing-range factor per sighting (bearing alone: a bearing factor); a new landmark starts where it is seen.
+    """A bearing-range factor per sighting (bearing alone: a bearing factor; a tag: a between factor); a new landmark starts where
+    it is seen.
 
     There is no native factor for a position in the frame of a pose: a position is turned into bearing and
     range with its covariance to first order, which is exact enough while sigma is small beside the range.
     """
-    points: dict[int, Array] = {}
+    points: dict[int, Any] = {}
 
     def sight(offer: Offer) -> Factor | Wait:
         return _sight(offer, context, config, points)
@@ -218,12 +226,10 @@ def _level(
     sensor that lies on its side, is turned upright in space before its height is dropped.
     """
     mount = _mount(m, context, config)
-    if context.space.name == "3d" or m.form != "position":
+    whole = tilted(context, m.frame) if m.form == "position" else None
+    if whole is None:
         return m, mount
-    whole = context.mounts.whole(m.frame)
-    turn = np.eye(3) if whole is None else whole.rotation().matrix()
-    if whole is None or turn[2, 2] > UPRIGHT:
-        return m, mount
+    turn = whole.rotation().matrix()
     if not np.isfinite(m.value).all():
         raise Unusable("not_finite", "a tilted sensor needs x, y and z")
     noise = defaulted(m.covariance, np.eye(3) * config.sigma_position**2)
@@ -231,21 +237,25 @@ def _level(
     return upright, context.space.identity
 
 
-def _sight(offer: Offer, context: Context, config: LandmarkSource, points: dict[int, Array]) -> Factor | Wait:
+def _sight(offer: Offer, context: Context, config: LandmarkSource, points: dict[int, Any]) -> Factor | Wait:
     """One sighting; a landmark that it makes is added to `points`."""
     m = offer.measurement
     assert isinstance(m, LandmarkObservation)
-    m, mount = _level(m, context, config)
+    turned = m.form == "pose" and config.orientation
+    key = context.tag(m.landmark) if turned else context.landmark(m.landmark)
+    if is_posed(key):
+        return _tag(offer, key, context, config, points)
+    m, mount = _level(positioned(m), context, config)
     placed = context.landing(m.stamp)
-    key, pose_key, space = context.landmark(m.landmark), placed.keyframe.pose, context.space
+    pose_key, space = placed.keyframe.pose, context.space
     known = key in points or context.component(key) is not None
     value, covariance = _in_space(m, context, config)
     if key not in points and known and context.component(key) != context.component(pose_key):
-        why, seen = "the landmark belongs to a part of the graph that is not connected yet", None
+        seen = None
         if m.form not in PLACELESS:
             _, _, point = _polar(m.form, (value, covariance), mount, placed.motion, space)
             seen = Seen(pose_key, key, point)
-        return Wait(offer, UNTIL_JOINED, why, seen)
+        return Wait(offer, UNTIL_JOINED, APART, seen)
     if m.form in PLACELESS and not known:
         return Wait(offer, key, f"one {m.form} alone cannot place a landmark")
     if m.form == "range":
@@ -258,6 +268,32 @@ def _sight(offer: Offer, context: Context, config: LandmarkSource, points: dict[
         points[key] = context.pose(pose_key).transformFrom(point)
     factor = space.observe(pose_key, key, value, noise_of(noise, config))
     return Factor(offer.id, "landmark", factor, (pose_key, key), offer.measurement.stamp)
+
+
+def positioned(m: LandmarkObservation) -> LandmarkObservation:
+    """A tag by its position alone; anything else as it is."""
+    if m.form != "pose":
+        return m
+    return replace(m, form="position", value=m.value[:3], covariance=m.covariance[:3, :3])
+
+
+def _tag(
+    offer: Offer, key: int, context: Context, config: LandmarkSource, points: dict[int, Any]
+) -> Factor | Wait:
+    """One sighting of a landmark that has an orientation."""
+    m = offer.measurement
+    assert isinstance(m, LandmarkObservation)
+    if m.form != "pose":
+        raise Unusable("orientation", f"landmark {m.landmark} is a tag: send its orientation, too")
+    placed, mount, space = context.landing(m.stamp), _mount(m, context, config), context.space
+    pose_key = placed.keyframe.pose
+    tag = tag_from_keyframe((m.value, m.covariance), m.frame, mount, placed.motion, context, config)
+    if key not in points and context.apart(key, pose_key):
+        return Wait(offer, UNTIL_JOINED, APART, Seen(pose_key, key, tag.pose))
+    if key not in points and context.component(key) is None:
+        points[key] = context.pose(pose_key).compose(tag.pose)
+    factor = space.between(pose_key, key, tag.pose, noise_of(tag.covariance, config))
+    return Factor(offer.id, "landmark", factor, (pose_key, key), m.stamp)
 
 
 def as_point(
@@ -339,7 +375,7 @@ def _in_space(m: LandmarkObservation, context: Context, config: LandmarkSource) 
         "bearing": (bearing, bearing),
         "range": (span,),
     }[m.form]
-    keep = [k for k in range(len(m.value)) if space.name == "3d" or k != vertical(m.form)]
+    keep = list(used_axes(m.form, len(m.value), space))
     covariance = defaulted(m.covariance[np.ix_(keep, keep)], np.diag([defaults[k] for k in keep]))
     value = m.value[keep]
     if scale != 1 and m.form in ("range", "bearing_range"):
@@ -352,3 +388,10 @@ def _in_space(m: LandmarkObservation, context: Context, config: LandmarkSource) 
 def vertical(form: Form) -> int | None:
     """The axis of a value that a plane does not have."""
     return {"position": 2, "range": None}.get(form, 1)
+
+
+def used_axes(form: Form, size: int, space: Space) -> tuple[int, ...]:
+    """Which of so many axes of noise the space has."""
+    if form == "pose":
+        return tuple(space.used)
+    return tuple(k for k in range(size) if space.name == "3d" or k != vertical(form))

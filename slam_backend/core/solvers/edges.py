@@ -8,9 +8,10 @@ from typing import Any
 import gtsam
 import numpy as np
 
-from ..graph import Factor, Pose, is_pose
+from ..graph import Factor, Pose
 from ..measurement import Array
 from ..space import Space
+from ..variables import is_posed
 from .gauges import Labels, Layout
 
 
@@ -43,7 +44,8 @@ class Edges:
 
 
 def edges_of(factors: Sequence[Factor], found: Layout, space: Space) -> Edges:
-    between = [factor for factor in factors if isinstance(factor.factor, space.between)]
+    """Those between poses of the robot; a tag is a landmark."""
+    between = [f for f in factors if isinstance(f.factor, space.between) and f.kind != "landmark"]
     ends = found.rows([key for factor in between for key in factor.keys]).reshape(-1, 2)
     return Edges(
         space,
@@ -67,8 +69,8 @@ def matrices_of(space: Space, poses: Sequence[Pose]) -> Array:
 
 
 def rotations_of(space: Space, values: gtsam.Values, found: Layout) -> Array:
-    """(N, d, d) of the layout's rows; identity for landmarks."""
-    keys = np.array([key for key in values.keys() if is_pose(key)], dtype=np.uint64)  # noqa: SIM118  # no mapping
+    """(N, d, d) of the layout's rows; identity for points."""
+    keys = np.array([key for key in values.keys() if is_posed(key)], dtype=np.uint64)  # noqa: SIM118  # no mapping
     here = np.flatnonzero(np.isin(found.keys, keys))
     rows = np.searchsorted(keys, found.keys[here])
     rotations = np.tile(np.eye(2 if space.name == "2d" else 3), (len(found.keys), 1, 1))

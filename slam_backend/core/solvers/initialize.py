@@ -19,6 +19,7 @@ from ..errors import BadConfig, SolverFailure
 from ..graph import HOLDING, Factor, Pose, is_pose
 from ..measurement import Array
 from ..space import Space
+from ..variables import is_posed
 from .batch import Start
 from .chordal import chordal
 from .descent import NO_FALL, SETTLED, Descent, Options, Progress, unwatched
@@ -208,8 +209,9 @@ def _complete(poses: gtsam.Values, ground: Ground) -> gtsam.Values:
     values.insert_or_assign(poses)
     for factor in ground.factors:
         if factor.kind == "landmark" and not values.exists(factor.keys[1]):
-            pose = ground.space.pose_in(values, factor.keys[0])
-            values.insert(factor.keys[1], pose.transformFrom(_seen(factor)))
+            pose, key = ground.space.pose_in(values, factor.keys[0]), factor.keys[1]
+            tag = pose.compose(factor.factor.measured()) if is_posed(key) else None
+            values.insert(key, pose.transformFrom(_seen(factor)) if tag is None else tag)
     for key in ground.keys:
         if not values.exists(key):
             raise SolverFailure(f"nothing says where {gtsam.DefaultKeyFormatter(key)} might be", ())

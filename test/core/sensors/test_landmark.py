@@ -19,6 +19,7 @@ from slam_backend.core.sensors.landmark import (
     decode_range,
     decode_tag,
     factors,
+    positioned,
 )
 
 KEYFRAMES = (2, 6, 11)  # s
@@ -235,14 +236,14 @@ def test_the_kernel_of_the_source_is_around_the_noise(world, offered):
 
 def tag_message(x, y, z, covariance=None) -> SimpleNamespace:
     header = SimpleNamespace(stamp=SimpleNamespace(sec=6, nanosec=0), frame_id="camera")
-    pose = SimpleNamespace(position=SimpleNamespace(x=x, y=y, z=z))
+    turned = SimpleNamespace(x=0.0, y=0.6, z=0.0, w=0.8)
+    pose = SimpleNamespace(position=SimpleNamespace(x=x, y=y, z=z), orientation=turned)
     told = SimpleNamespace(pose=pose, covariance=np.zeros(36) if covariance is None else covariance)
     return SimpleNamespace(header=header, child_frame_id="tag36h11:5", pose=told)
 
 
 def test_a_tag_is_a_landmark_that_is_named_by_its_family_and_number():
-    covariance = np.zeros((6, 6))
-    covariance[:3, :3] = np.diag([0.01, 0.02, 0.03])
+    covariance = np.diag([0.01, 0.02, 0.03, 0.04, 0.05, 0.06])
     seen = decode_tag(tag_message(1.0, 2.0, 3.0, covariance.ravel()), "tags")
     assert (seen.stamp, seen.source, seen.frame, seen.landmark) == (
         6 * SECOND,
@@ -250,15 +251,15 @@ def test_a_tag_is_a_landmark_that_is_named_by_its_family_and_number():
         "camera",
         "tag36h11:5",
     )
-    assert (seen.form, seen.value.tolist()) == ("position", [1.0, 2.0, 3.0])
-    np.testing.assert_array_equal(seen.covariance, np.diag([0.01, 0.02, 0.03]))
+    assert (seen.form, seen.value.tolist()) == ("pose", [1.0, 2.0, 3.0, 0.0, 0.6, 0.0, 0.8])
+    np.testing.assert_array_equal(seen.covariance, covariance)
 
 
 def test_in_the_plane_too_an_optical_frame_looks_along_its_z_axis(world, offered):
     """x of an optical frame is to the right, y down: a tag 5 m ahead and 1 m to the right is there in either space."""
     optical = {"camera": (0.3, 0.0, 0.6, -np.pi / 2, 0.0, -np.pi / 2)}
     context = replace(world.context(), mounts=Mounts(world.space, "base_link", optical))
-    seen = replace(decode_tag(tag_message(1.0, 0.2, 5.0), "tags"), landmark="oak")
+    seen = positioned(replace(decode_tag(tag_message(1.0, 0.2, 5.0), "tags"), landmark="oak"))
     world.known.discard("oak")
     delta = factors(offered(seen), None, None, context, LandmarkSource())
     from_base = world.pose(delta.add[0].keys[0]).transformTo(delta.values[world.key("oak")])
@@ -353,6 +354,17 @@ def test_missing_axes_are_zero_and_missing_noise_is_nan():
     assert polar.form == "bearing_range"
     np.testing.assert_array_equal(polar.value, [0.5, 0.1, 4.0])
     np.testing.assert_allclose(np.diag(polar.covariance), [np.nan, np.nan, 0.09])
+
+
+def test_a_quaternion_beside_a_position_and_an_id_is_a_pose():
+    """Its noise has six axes; without an id it is a position, since orientations are not associated."""
+    turned = {"qx": [0.0], "qy": [0.6], "qz": [0.0], "qw": [0.8]}
+    place = {"x": [1.0], "y": [2.0], "z": [3.0], **turned, "sigma_position": [0.1], "sigma_yaw": [0.2]}
+    (seen,) = decode_points(cloud(id=[5], **place), "tags")
+    assert (seen.form, seen.value.tolist()) == ("pose", [1.0, 2.0, 3.0, 0.0, 0.6, 0.0, 0.8])
+    np.testing.assert_allclose(np.sqrt(np.diag(seen.covariance)), [0.1] * 3 + [np.nan] * 2 + [0.2])
+    (bare,) = decode_points(cloud(**place), "tags")
+    assert (bare.form, bare.value.tolist()) == ("position", [1.0, 2.0, 3.0])
 
 
 def test_a_full_covariance_is_taken_as_it_stands():

@@ -7,17 +7,18 @@ import pytest
 
 from slam_backend.core.backend import Backend
 from slam_backend.core.config import config_from
+from slam_backend.core.graph import Pose
 from slam_backend.core.measurement import SECOND, frozen
 from slam_backend.core.robust.chi2 import chi2_quantile
 from slam_backend.core.sensors.landmark import LandmarkObservation
 from slam_backend.core.sensors.odometry import STILL, UNKNOWN, OdometryPose
-from slam_backend.core.space import SPACES
+from slam_backend.core.space import SPACES, Space
 
 STEPS = 8
 SIGMA_TRANSLATION, SIGMA_ROTATION = 0.05, 0.02  # m, rad after 1 m
 SIGMA_POSITION, SIGMA_BEARING, SIGMA_RANGE = 0.1, 0.02, 0.15
 LANDMARKS = np.array([[4.0, 3.0, 1.0], [2.0, -4.0, -1.0], [7.0, 2.0, 0.5], [9.0, -3.0, 1.5]])
-FORMS = [(space, form) for space in ("2d", "3d") for form in ("position", "bearing_range")]
+FORMS = [(space, form) for space in ("2d", "3d") for form in ("position", "bearing_range", "pose")]
 
 
 def sighting(
@@ -34,6 +35,16 @@ def sighting(
     return LandmarkObservation(stamp, "trees", "", name, form, frozen(noisy), frozen(np.diag(sigmas**2)))
 
 
+def sighting_of_tag(
+    rng: np.random.Generator, space: Space, stamp: int, name: str, tag: Pose
+) -> LandmarkObservation:
+    """A tag in the frame of the base, its noise about the fixed axes of that frame."""
+    stated = np.diag([SIGMA_POSITION**2] * 3 + [SIGMA_BEARING**2] * 3)
+    noise = rng.multivariate_normal(np.zeros(space.dimension), space.covariance(stated.ravel(), tag))
+    value = frozen(space.seven(tag.compose(space.expmap(noise))))
+    return LandmarkObservation(stamp, "trees", "", name, "pose", value, frozen(stated))
+
+
 def nees(space_name: str, form: str, seed: int) -> float:
     """Squared Mahalanobis distance of the last pose and the first landmark together."""
     rng, space = np.random.default_rng(seed), SPACES[space_name]
@@ -48,6 +59,7 @@ def nees(space_name: str, form: str, seed: int) -> float:
         "wheels": wheels | none, "trees": {"kind": "landmark"},
     }))  # fmt: skip
     points = LANDMARKS[:, : space.point_dimension] * 1.0
+    tags = [space.from_extrinsics((*point, 0.2, -0.1, n)) for n, point in enumerate(LANDMARKS)]
     twist = np.array([1.0, 0, 0.1]) if space_name == "2d" else np.array([0.03, -0.02, 0.1, 1.0, 0, 0])
     variances = space.diagonal(SIGMA_ROTATION**2, SIGMA_TRANSLATION**2)
     truth = told = space.identity
@@ -60,6 +72,9 @@ def nees(space_name: str, form: str, seed: int) -> float:
                 space.expmap(rng.multivariate_normal(np.zeros(space.dimension), variances))
             )
         for n, point in enumerate(points):
+            if form == "pose":
+                backend.add(sighting_of_tag(rng, space, stamp, str(n), truth.inverse().compose(tags[n])))
+                continue
             seen = np.zeros(3)
             seen[: space.point_dimension] = truth.transformTo(point)
             backend.add(sighting(rng, form, stamp, str(n), seen))
@@ -69,14 +84,16 @@ def nees(space_name: str, form: str, seed: int) -> float:
     backend.finish()
     backend.polish()
     keys = [backend.timeline.keyframes[-1].pose, backend.landmark("0")]
-    pose, point = backend.estimate.pose(keys[0]), backend.estimate.point(keys[1])
-    error = np.concatenate([space.logmap(pose.between(truth)), points[0] - point])
+    pose, found = backend.estimate.pose(keys[0]), backend.estimate.value(keys[1])
+    off = space.logmap(found.between(tags[0])) if form == "pose" else points[0] - found
+    error = np.concatenate([space.logmap(pose.between(truth)), off])
     return float(error @ np.linalg.solve(backend.estimate.covariance(keys), error))
 
 
 def consistent(space: str, form: str, runs: int) -> None:
     mean = np.mean([nees(space, form, seed) for seed in range(runs)])
-    dof = SPACES[space].dimension + SPACES[space].point_dimension
+    sizes = SPACES[space]
+    dof = sizes.dimension + (sizes.dimension if form == "pose" else sizes.point_dimension)
     low, high = (chi2_quantile(p, dof * runs) / runs for p in (0.0005, 0.9995))
     assert low < mean < high
 
