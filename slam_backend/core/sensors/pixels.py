@@ -23,6 +23,7 @@ from .frames import Frame
 from .tracks import Tracker
 
 STAGE = "pixels"
+LARGEST, SHARPEST = 1e6, 1e-4  # pixels; of no image, and of no way to find features
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -113,6 +114,10 @@ def _frame(
         "not_finite": (
             np.isfinite(pixels[:, :2]).all(axis=1) & (sigmas > 0) & np.isfinite(sigmas),
             "pixel or sigma",
+        ),
+        "absurd": (
+            ~(np.abs(pixels) > LARGEST).any(axis=1) & ~(sigmas < SHARPEST) & ~(sigmas > LARGEST),
+            f"a pixel beyond {LARGEST:g}, or a sigma below {SHARPEST:g}",
         ),
         "behind": (~stereo | (pixels[:, 0] > pixels[:, 2]), "further right in the right image"),
         "twice": (once, "the id is there already"),

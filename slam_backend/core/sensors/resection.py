@@ -6,7 +6,7 @@ import numpy as np
 
 from ..graph import Motion, Pose
 from ..measurement import Array
-from .triangulation import Lens, cross, images, of_image
+from .triangulation import Lens, cross, images, of_image, whitening
 
 STEPS = 8  # of Gauss-Newton
 CAUCHY = 2.3849  # standard deviations: 95 % efficiency where all is well
@@ -69,7 +69,6 @@ def judged(
     noise = in_camera @ known.covariances @ np.swapaxes(in_camera, 1, 2)
     if pose_covariance is not None:
         noise = noise + by_pose @ pose_covariance @ np.swapaxes(by_pose, 1, 2)
-    noise[:, range(3), range(3)] += (known.sigmas**2)[:, None]
-    whitening = np.linalg.inv(np.linalg.cholesky(noise))
-    error = (whitening @ error[:, :, None])[:, :, 0]
-    return error, whitening @ by_pose, np.where(behind, np.inf, (error**2).sum(axis=1))
+    root = whitening(noise, known.sigmas)
+    error = (root @ error[:, :, None])[:, :, 0]
+    return error, root @ by_pose, np.where(behind, np.inf, (error**2).sum(axis=1))

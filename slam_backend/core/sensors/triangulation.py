@@ -213,9 +213,21 @@ def _whitening(seen: Sightings, by_pose: Array) -> Array:
     """(N, 3, 3) W with W^T W the information of an image whose camera stands where it stands by its covariance."""
     assert seen.covariances is not None
     noise = by_pose @ seen.covariances @ np.swapaxes(by_pose, 1, 2)
+    return whitening(noise, seen.sigmas)
+
+
+def whitening(noise: Array, sigmas: Array) -> Array:
+    """(N, 3, 3) W with W^T W the inverse of (N, 3, 3) noise plus that of the pixels themselves, (N,). What is not finite of the
+    noise is left out, and what rounding has made of directions without noise.
+    """
     noise = np.where(np.isfinite(noise), noise, 0.0)
-    noise[:, range(3), range(3)] += (seen.sigmas**2)[:, None]
-    return np.linalg.inv(np.linalg.cholesky(noise))
+    noise[:, range(3), range(3)] += (sigmas**2)[:, None]
+    try:
+        return np.linalg.inv(np.linalg.cholesky(noise))
+    except np.linalg.LinAlgError:
+        values, vectors = np.linalg.eigh((noise + np.swapaxes(noise, 1, 2)) / 2)
+        values = np.maximum(values, (sigmas**2)[:, None])
+        return np.asarray(np.swapaxes(vectors, 1, 2) / np.sqrt(values)[:, :, None])
 
 
 def _apply(matrices: Array, vectors: Array) -> Array:
