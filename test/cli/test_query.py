@@ -230,7 +230,10 @@ def test_a_missing_or_damaged_file_is_one_line_that_names_it(
     if damage == "missing":
         path.unlink()
     else:
-        path.write_bytes(b"\xff\xfe\x00\x01{" if damage == "binary" else data[: len(data) // 2 - 7])
+        half = len(data) // 2 - 7
+        if name == "config.yaml":  # whole lines would be a configuration again: cut within a key
+            half = data.rindex(b":", 0, half)
+        path.write_bytes(b"\xff\xfe\x00\x01{" if damage == "binary" else data[:half])
     stamp = format_stamp(int(drive[0].trajectory.stamps[-2]) + 7)
     decision = list(drive[0].decisions)[len(list(drive[0].decisions)) // 2].id
     names = ["pose@now", f"pose@{stamp}#cov", "landmark/7", f"decision/{decision}"]
