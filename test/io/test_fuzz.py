@@ -389,7 +389,7 @@ def prove(driver: str, space: str, noise: str, seed: int, bad: int) -> int:
     np.testing.assert_allclose(first.trajectory.sevens, second.trajectory.sevens, atol=1e-6, rtol=1e-6)
     assert np.isfinite(first.trajectory.sevens).all()
     survive = {BEGIN + n * STEP for n in range(KEYFRAMES)} & set(first.stamps.tolist())
-    assert len(survive) > (MOST if INPUTS[driver].kind == "odometry" else HALF) * KEYFRAMES
+    assert len(survive) >= (MOST if INPUTS[driver].kind == "odometry" else HALF) * KEYFRAMES
     assert all(decision.reason for decision in log)
     assert len(log) < 10 * len(records)
     return len(records) - len(sound)
