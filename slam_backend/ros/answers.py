@@ -1,8 +1,7 @@
 """~/get_trajectory, served by a process of its own: an answer of 10,000 poses would stop the node's callbacks for long.
 
 The process has a context and a node of its own. Asked for a trajectory, it asks the node's process for the newest
-snapshot over a pipe; there a thread answers, with arrays that are written as they lie in memory. It runs at the node's own priority: what it holds of DDS's shared
-memory while it is preempted, the node waits for (at nice 10, 99 % of ~/odometry came within 230 ms instead of 6).
+snapshot over a pipe; there a thread answers, with arrays that are written as they lie in memory.
 """
 
 import math
