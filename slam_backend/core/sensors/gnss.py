@@ -28,15 +28,11 @@ from ..robust.kernels import noise_of, with_kernel
 
 UNKNOWN, DIAGONAL = 0, 2  # of position_covariance_type; 1 is approximated, 3 known as a whole
 SEEN = 64  # fixes that the first guess looks at, however many wait
-BROAD, SURE = (
-    100.0,
-    1e-4,
-)  # m: what is known of where the robot is on the earth; m and rad: of the earth in the map
+BROAD = 100.0  # m; of where the robot is on the earth, before the fixes are used
+SURE = 1e-4  # m and rad; of the earth in the map, where it holds the graph
 ROUNDS = 10  # of reweighting
-MISFIT, SLIP = (
-    3.0,
-    0.2,
-)  # standard deviations, and m per m of odometry, by which the better half of the fixes may lie aside
+MISFIT = 3.0  # standard deviations by which the better half of the fixes may lie aside,
+SLIP = 0.2  # and m per m of odometry beside
 
 
 @dataclass(frozen=True, slots=True, eq=False)
