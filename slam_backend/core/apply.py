@@ -20,8 +20,8 @@ class Applier:
     """Gives changes to the solver and keeps the books: decisions, parts, and who waits for which variable.
 
     A measurement that connects something is a change of its own: the first absolute pose of a part moves the part
-    there and replaces its gauge; a relative pose between two parts moves the later one to where it says. Both are
-    sets of first guesses for variables that exist, so that the solver starts near the answer.
+    there and replaces its gauge; a relative pose between two parts, or what fixes tell of the earth that one of them knows, moves
+    the later one to where it says. All are sets of first guesses for variables that exist, so that the solver starts near the answer.
     """
 
     def __init__(
@@ -65,7 +65,8 @@ class Applier:
         if factor.kind == "pose":
             part = self._parts.of(factor.keys[0])
             return part is not None and self._parts.is_loose(part)
-        return all(map(is_pose, factor.keys)) and len(self._parts_of(factor)) == 2
+        posed = factor.kind == "earth" or all(map(is_pose, factor.keys))
+        return posed and len(self._parts_of(factor)) == 2
 
     def _parts_of(self, factor: Factor) -> set[int]:
         return {part for key in factor.keys if (part := self._parts.of(key)) is not None}
@@ -128,8 +129,9 @@ class Applier:
     def _shift(self, part: int, event: Factor) -> Pose:
         """The motion of a part as a whole that makes the event's error zero."""
         assert self.estimate is not None
-        poses = [self.estimate.pose(key) for key in event.keys]
-        return shift_of(event, poses, last=self._parts.of(event.keys[-1]) == part)
+        keys = event.factor.keys()
+        poses = [self.estimate.pose(key) for key in keys]
+        return shift_of(event, poses, last=self._parts.of(keys[-1]) == part)
 
     def _moved(self, part: int, shift: Pose) -> dict[int, Any]:
         """The variables of a part, moved as a whole."""

@@ -587,7 +587,7 @@ class Backend:
     def _gauge(self, key: int) -> str | None:
         """What holds the part of a variable, where the earth may take its place: nothing else will say where the map lies."""
         part = self.parts.of(key)
-        others = any(source.kind == "pose" for source in self.config.sources.values())
+        others = self.parts.home is not None or any(s.kind == "pose" for s in self.config.sources.values())
         return None if others or part is None or not self.parts.is_loose(part) else self.parts.gauge(part)
 
     def landmark(self, name: str) -> int:

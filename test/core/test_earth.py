@@ -1,13 +1,22 @@
 """A whole back-end on the earth: the yaw that nobody knew is found, what holds the map changes hands, and all of it survives."""
 
+from dataclasses import replace
+
 import numpy as np
+import pymap3d
 import pytest
 
 from slam_backend.core.graph import DATUM, EARTH
 from slam_backend.core.measurement import SECOND, frozen
+from slam_backend.core.sensors.gnss import Fix
 from slam_backend.core.sensors.pose import AbsolutePose
 from slam_backend.core.sensors.relative import RelativePose
 from slam_backend.core.space import SPACES
+from slam_backend.core.trajectory import Trajectory
+
+LATER = 1000 * SECOND  # between two drives
+FAR = (400.0, -300.0, 0.0)  # m east, north, up: from the first drive to the second
+NOTHING = Trajectory(np.zeros(0, dtype=np.int64), np.zeros((0, 7)))
 
 
 @pytest.fixture(params=["2d", "3d"])
@@ -117,3 +126,71 @@ def test_a_session_goes_on_on_the_same_earth_once_it_has_found_the_map(road, spa
     assert len(second.parts) == 1
     assert sum(f.kind == "gnss" for f in second.solver.factors.values()) > 100
     assert np.sqrt(np.mean(road.errors(second, truth) ** 2)) < 0.3
+
+
+def another(road, space, **length):
+    """A second drive, another day and somewhere else, whose odometry begins at its own origin: (measurements, true poses)."""
+    items, truth = road.drive(space, seed=1, **length)
+    there = SPACES[space].from_extrinsics((*FAR, 0.0, 0.0, 0.0))
+    return [_elsewhere(item, road.origin) for item in items], [there.compose(pose) for pose in truth]
+
+
+def _elsewhere(item, origin):
+    item = replace(item, stamp=item.stamp + LATER)
+    if not isinstance(item, Fix):
+        return item
+    place = np.array(pymap3d.geodetic2enu(*item.place, *origin)) + FAR
+    return replace(item, place=frozen(pymap3d.enu2geodetic(*place, *origin)))
+
+
+def test_a_second_drive_is_joined_to_the_map_by_its_fixes_far_from_where_the_first_began(road, space):
+    """No loop, no landmark in common: the earth is what both know."""
+    items, truth = road.drive(space)
+    first = road.backend(space, earth={"origin": road.origin})
+    road.run(first, items)
+    second = road.backend(space)  # the map has an origin
+    second.load(first.saved(NOTHING))
+    later, true = another(road, space)
+    decisions = road.run(second, later)
+    assert len(second.parts) == 1
+    assert [d.verdict for d in decisions if (d.stage, d.reason) == ("gnss", "joined")] == ["accepted"]
+    used = [sum(f.kind == "gnss" for f in each.solver.factors.values()) for each in (first, second)]
+    assert used[1] == used[0] + 120, "none is lost"
+    assert [id_ for id_, factor in second.solver.factors.items() if factor.kind in ("gauge", "datum")] == [
+        DATUM
+    ]
+    away = road.errors(second, [*truth, *true])
+    assert np.sqrt(np.mean(away[120:] ** 2)) < 0.25
+    before, after = (each.snapshot().trajectory.sevens[:120, :3] for each in (first, second))
+    np.testing.assert_allclose(after, before, atol=0.02)
+
+
+def test_a_second_drive_is_apart_until_its_fixes_tell_the_yaw(road, space):
+    first = road.backend(space)
+    road.run(first, road.drive(space)[0])
+    second = road.backend(space)
+    second.load(first.saved(NOTHING))
+    decisions = road.run(second, another(road, space, seconds=4)[0])
+    assert len(second.parts) == 2
+    assert all("yaw not yet observable" in d.detail for d in decisions)
+    assert {d.verdict for d in decisions} == {"probation", "refused"}
+
+
+def test_the_earth_of_a_second_drive_moves_with_it_when_a_loop_joins_a_map_without_fixes(road, loop, space):
+    """Nothing but the map's own first pose holds it."""
+    items, truth = road.drive(space)
+    first = road.backend(space)
+    road.run(first, [item for item in items if not isinstance(item, Fix)])
+    second = road.backend(space, sources={"loops": {"kind": "relative"}}, earth={"origin": road.origin})
+    second.load(first.saved(NOTHING))
+    later, true = another(road, space)
+    shape, end = SPACES[space], later[-1].stamp
+    seen, noise = frozen(shape.seven(truth[-1].between(true[-1]))), frozen(np.eye(6).ravel() * 1e-4)
+    road.run(second, [*later, RelativePose(end, "loops", items[-1].stamp, end, "base", "base", seen, noise)])
+    assert len(second.parts) == 1
+    assert not [factor for factor in second.solver.factors.values() if factor.kind == "datum"]
+    poses = [second.estimate.pose(k.pose) for k in second.timeline.keyframes]
+    assert shape.size(poses[119].compose(truth[-1].between(true[-1])).between(poses[-1]))[0] < 0.1
+    assert shape.size(poses[0])[0] < 0.01, "the map stays"
+    away = road.errors(second, [*truth, *true])
+    assert np.sqrt(np.mean(away[120:] ** 2)) < 0.25

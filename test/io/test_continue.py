@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -27,13 +28,14 @@ JOINTS = {
     "landmarks": ("/loops",),
     "nothing": ("/landmarks", "/loops"),
 }
+FIXES = replace(OPTIONS, gnss_every=5)
 
 
 class Drive:
     """A world driven through in one go, cut after three fifths into two bags."""
 
-    def __init__(self, folder, world, without):
-        written = write_simulation(simulate(world, 3, OPTIONS), folder / "drive.mcap")
+    def __init__(self, folder, world, without, options=OPTIONS):
+        written = write_simulation(simulate(world, 3, options), folder / "drive.mcap")
         with open_bag(written.bag) as bag:
             records = [record for record in bag.records() if record.topic not in without]
         middle = (2 * records[0].log_time + 3 * records[-1].log_time) // 5
@@ -92,6 +94,17 @@ def test_the_joined_map_is_as_good_as_one_run_over_both(tmp_path, world, joint):
     old = result.trajectory.sevens[: len(drive.before.trajectory)]
     moved = np.linalg.norm(old[:, :3] - drive.before.trajectory.sevens[:, :3], axis=1).max()
     assert moved < (1e-9 if joint == "nothing" else 0.5), "the old trajectory stays"
+
+
+@pytest.mark.parametrize("world", ["square", pytest.param("spiral", marks=pytest.mark.slow)])
+def test_fixes_alone_join_what_goes_on(tmp_path, world):
+    """The map knows its earth, and the new drive is laid there; a single fix is 0.5 m off on each axis."""
+    drive = Drive(tmp_path, world, JOINTS["nothing"], FIXES)
+    result = replay(drive.second, continued=drive.run).result
+    assert result.summary["counts"]["parts"] == 1
+    assert result.summary["decisions"]["gnss/joined"] == 1
+    assert drive.error(result.trajectory) < 0.25
+    assert replay(drive.second, continued=drive.run).result.summary["run_hash"] == result.summary["run_hash"]
 
 
 def test_what_is_saved_is_read_to_the_bit(drive, tmp_path):

@@ -22,7 +22,7 @@ import pymap3d
 
 from ..config import GnssSource
 from ..context import Context, Unusable, each
-from ..graph import DATUM, EARTH, Delta, Factor, Keyframe, Motion, Offer, Pose, Wait
+from ..graph import DATUM, EARTH, UNTIL_JOINED, Decision, Delta, Factor, Keyframe, Motion, Offer, Pose, Wait
 from ..measurement import Array, Decoder, Measurement, Message, format_stamp, frozen, stamp_of
 from ..robust.kernels import noise_of, with_kernel
 
@@ -33,6 +33,9 @@ SURE = 1e-4  # m and rad; of the earth in the map, where it holds the graph
 ROUNDS = 10  # of reweighting
 MISFIT = 3.0  # standard deviations by which the better half of the fixes may lie aside,
 SLIP = 0.2  # and m per m of odometry beside
+JOINED = (
+    "the fixes tell where this part of the map lies on the earth, which another part knows: they are one now"
+)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -72,18 +75,34 @@ def factors(
     config: GnssSource,
 ) -> Delta:
     """A factor per fix, on the keyframe; until the yaw of the earth can be told, the fixes wait for it."""
-    if context.known(EARTH):
+    known, apart = context.known(EARTH), context.apart(b.pose, EARTH)
+    if known and not apart:
         return each(window, "gnss", lambda offer: _factor(offer, context, config))
-    fixes = [*(wait.offer for wait in context.waiting(EARTH)), *window]
-    found = _first_guess(_sights(fixes, context, config), context)
+    until = UNTIL_JOINED if apart else EARTH
+    fixes = [*(wait.offer for wait in context.waiting(until)), *window]
+    found = _first_guess(_sights(fixes, b, context, config), context)
     if isinstance(found, str):
-        return each(window, "gnss", lambda offer: Wait(offer, EARTH, found))
+        return each(window, "gnss", lambda offer: Wait(offer, until, found))
+    if apart:
+        return _joined(found, window, b, context)
     gauge = context.gauge(b.pose)
     laid = (_laid(found, b, context), *([] if gauge is None else [_datum(found, b, context)]))
     context = replace(context, guesses={**context.guesses, EARTH: found}, has_datum=gauge is not None)
     delta = each(window, "gnss", lambda offer: _factor(offer, context, config))
     remove = () if gauge is None else (gauge,)
     return replace(delta, add=(*laid, *delta.add), remove=remove, values={EARTH: found})
+
+
+def _joined(guess: Pose, window: Sequence[Offer], b: Keyframe, context: Context) -> Delta:
+    """The earth is known in another part of the graph: this one is moved to where its fixes lie there, and all that waited goes in
+    then. guess: `map_T_earth` as this part would have it.
+    """
+    name = window[0].measurement.source
+    laid = _laid(guess, b, context)
+    laid = replace(laid, id=f"{laid.id}:{name}")  # another receiver may say the same at this keyframe
+    told = Decision(b.stamp, laid.id, name, "accepted", "gnss", "joined", JOINED)
+    waits = tuple(Wait(offer, UNTIL_JOINED, "used as soon as the two parts are one") for offer in window)
+    return Delta((laid,), waits=waits, decisions=(told,))
 
 
 def enu(places: Array, origin: Sequence[float]) -> Array:
@@ -103,7 +122,7 @@ def _factor(offer: Offer, context: Context, config: GnssSource) -> Factor | Wait
     placed, arm = context.landing(m.stamp), context.mount(m.frame).translation()
     key, size = placed.keyframe.pose, space.point_dimension
     if context.apart(key, EARTH):
-        return Wait(offer, 0, "the earth belongs to a part of the graph that is not connected yet")
+        return Wait(offer, UNTIL_JOINED, "the earth belongs to a part of the graph that is not connected yet")
     keyframe_T_base = placed.motion.pose if placed.motion else space.identity
     keyframe_T_antenna = keyframe_T_base.compose(space.rigid(np.eye(size), arm))
     map_T_earth = context.pose(EARTH)
@@ -144,18 +163,19 @@ def _of_motion(motion: Motion, arm: Array) -> Array:
     return np.asarray(of_pose @ motion.covariance @ of_pose.T)
 
 
-def _sights(offers: Sequence[Offer], context: Context, config: GnssSource) -> Array:
-    """(N, 9) of some of the fixes: antenna by odometry in the map, antenna by the fix, standard deviation, all in m; then x and y of
+def _sights(offers: Sequence[Offer], b: Keyframe, context: Context, config: GnssSource) -> Array:
+    """(N, 9) of some of the fixes in the part of b: antenna by odometry in the map, antenna by the fix, standard deviation, all in m; then x and y of
     the direction that the base looks in.
     """
     rows = []
-    for offer in offers[:: -(-len(offers) // SEEN) or 1]:
-        m = offer.measurement
-        assert isinstance(m, Fix)
+    fixes = [offer.measurement for offer in offers if isinstance(offer.measurement, Fix)]
+    for m in fixes[:: -(-len(fixes) // SEEN) or 1]:
         assert context.origin is not None
         try:
             placed, mount = context.landing(m.stamp), context.mount(m.frame)
         except Unusable:
+            continue
+        if context.apart(placed.keyframe.pose, b.pose):
             continue
         pose = context.pose(placed.keyframe.pose)
         pose = pose.compose(placed.motion.pose) if placed.motion else pose

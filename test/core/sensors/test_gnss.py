@@ -56,7 +56,9 @@ def test_a_true_fix_has_no_error_at_the_truth_however_the_first_guess_was_turned
     world, offered, frame, stamp, turned
 ):
     seen = fix(world, frame, stamp)
-    (made,) = factors(offered(seen), None, None, context_of(world, turned), GnssSource()).add
+    (made,) = factors(
+        offered(seen), None, world.timeline.keyframes[1], context_of(world, turned), GnssSource()
+    ).add
     assert made.keys == (world.place(stamp).keyframe.pose, EARTH)
     assert (made.kind, made.source, made.stamp) == ("gnss", "gps", stamp)
     assert made.factor.error(values_of(world)) < 1e-9
@@ -71,7 +73,7 @@ def test_the_noise_is_that_of_the_fix_and_of_the_motion(world, offered, agree, s
     errors = []
     for _ in range(1_500):
         seen = fix(world, frame, stamp, covariance, rng)
-        (made,) = factors(offered(seen), None, None, context, GnssSource()).add
+        (made,) = factors(offered(seen), None, world.timeline.keyframes[1], context, GnssSource()).add
         errors.append(made.factor.whitenedError(values)[: world.space.point_dimension])
     agree(errors)
 
@@ -80,7 +82,9 @@ def test_its_derivative_is_that_of_its_error(world, offered):
     """Central differences, away from the truth and from the guess."""
     rng, size = np.random.default_rng(3), world.space.dimension
     seen = fix(world, "mast", AFTER, rng=rng)
-    (made,) = factors(offered(seen), None, None, context_of(world, 0.1), GnssSource()).add
+    (made,) = factors(
+        offered(seen), None, world.timeline.keyframes[1], context_of(world, 0.1), GnssSource()
+    ).add
     factor, values = made.factor, gtsam.Values()
     for key in made.keys:
         values.insert(key, values_of_pose(world, key).compose(world.space.expmap(rng.normal(0, 0.1, size))))
@@ -108,7 +112,9 @@ def test_with_the_earth_at_hand_its_cost_is_that_of_the_native_factor_with_an_ar
         pytest.skip("there is no native factor with an arm in the plane")
     rng, size = np.random.default_rng(4), world.space.dimension
     seen = fix(world, "mast", AT_KEYFRAME, rng=rng)
-    (made,) = factors(offered(seen), None, None, context_of(world, 0.03), GnssSource()).add
+    (made,) = factors(
+        offered(seen), None, world.timeline.keyframes[1], context_of(world, 0.03), GnssSource()
+    ).add
     key = made.keys[0]
     enu = np.array(pymap3d.geodetic2enu(*seen.place, *ORIGIN))
     noise = gtsam.noiseModel.Gaussian.Covariance(seen.covariance)
@@ -194,11 +200,13 @@ def test_a_fix_on_a_part_that_the_earth_does_not_belong_to_waits_until_they_are_
     context = replace(
         world.context(), origin=ORIGIN, estimate=SimpleNamespace(pose=lambda key: values_of_pose(world, key))
     )
-    delta = factors(offered(fix(world, "", AT_KEYFRAME)), None, None, context, GnssSource())
+    delta = factors(
+        offered(fix(world, "", AT_KEYFRAME)), None, world.timeline.keyframes[1], context, GnssSource()
+    )
     assert [wait.until for wait in delta.waits] == [UNTIL_JOINED]
 
 
 def test_an_antenna_that_nobody_mounted_makes_no_factor(world, offered):
     seen = replace(fix(world, "", AT_KEYFRAME), frame="roof")
-    delta = factors(offered(seen), None, None, context_of(world), GnssSource())
+    delta = factors(offered(seen), None, world.timeline.keyframes[1], context_of(world), GnssSource())
     assert [(d.stage, d.reason) for d in delta.decisions] == [("gnss", "unknown_frame")]
