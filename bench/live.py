@@ -1,6 +1,7 @@
 """The node over real DDS, between processes: what is lost, how long everything takes, and whether live is replay."""
 
 import json
+import os
 import signal
 import time
 from collections.abc import Callable, Iterator
@@ -51,6 +52,7 @@ def rows() -> list[Row]:
         print("live: rclpy is not installed; left out")
         return []
     own_network()
+    os.environ.setdefault(TRANSPORTS, OVER_UDP)
     return [*loaded(), *stalled(), *large(), *started(), *equal()]
 
 

@@ -6,6 +6,7 @@ so that it never waits for the solver. No callback blocks, and none ends the nod
 """
 
 import gc
+import os
 import signal
 import sys
 import threading
@@ -51,6 +52,10 @@ WATCHED = ("path", "trajectory", "landmarks", "graph")  # outputs that are made 
 FAREWELL = 30.0  # s that the worker may take to flush and save at the end
 DEFAULT_ODOM = Config().odom_frame
 AGAIN = 5.0  # s after which the same incident is worth another line
+TRANSPORTS, OVER_UDP = (
+    "FASTDDS_BUILTIN_TRANSPORTS",
+    "UDPv4",
+)  # through shared memory, each process that appears would stop all publishers for 0.3 s (Fast DDS issue 6535)
 STEADY = Clock(clock_type=ClockType.STEADY_TIME)  # timers run whether or not /clock does
 
 
@@ -397,6 +402,7 @@ def main(arguments: list[str] | None = None, config: Config | None = None) -> in
 
     config: what the parameters start from; ROS arguments override it.
     """
+    os.environ.setdefault(TRANSPORTS, OVER_UDP)
     wishes: list[int] = []
     for wish in (signal.SIGINT, signal.SIGTERM):
         signal.signal(wish, lambda number, _: wishes.append(number))  # more than one changes nothing
