@@ -9,6 +9,7 @@ from contextlib import contextmanager
 from importlib.util import find_spec
 from itertools import count, takewhile
 from pathlib import Path
+from statistics import median
 from tempfile import TemporaryDirectory
 from typing import Any
 
@@ -26,6 +27,11 @@ from slam_backend.lab.options import Options
 from slam_backend.lab.simulate import simulate, write_simulation
 
 LOAD = Path(__file__).parent / "load.py"
+LOOPBACK = {
+    "FASTRTPS_DEFAULT_PROFILES_FILE": str(Path(__file__).parent / "loopback.xml"),
+    "ROS_AUTOMATIC_DISCOVERY_RANGE": "SYSTEM_DEFAULT",  # the only one that leaves the transports to the profile
+}
+STARTS = 7
 SOURCES = (
     "space=2d",
     "sources=[wheels,loops]",
@@ -39,9 +45,11 @@ HALF = 5000  # keyframes
 
 TITLE = "Live"
 EXPLANATION = (
-    "The node, its worker, and senders, listeners and clients in processes of their own, over DDS on one machine; all times by the "
-    "clock on the wall, so they need a machine that does nothing else. `lost`: messages sent, less those in the journal. Latency of "
+    "The node, its worker, and senders, listeners and clients in processes of their own, over DDS on one machine, by UDP "
+    "(with Fast DDS's shared memory each process that appears stops all publishers for a third of a second: its issue 6535); all times by "
+    "the clock on the wall, so they need a machine that does nothing else. `lost`: messages sent, less those in the journal. Latency of "
     "`~/odometry`: from before it is published to its receipt, 99th percentile. Client: Python, its own decoding included. "
+    "Start: Fast DDS announces a participant before it hears; where the answer comes at once, it is lost, and repeated after 3 s. "
     f"Equal hashes: of three live runs at {RATE} times the speed, all at once, of the first {CUT} s of a recording, each with the "
     "replay of its journal, and with that of the bag where no record is missing."
 )
@@ -52,7 +60,7 @@ def rows() -> list[Row]:
         print("live: rclpy is not installed; left out")
         return []
     own_network()
-    os.environ.setdefault(TRANSPORTS, OVER_UDP)
+    os.environ |= LOOPBACK
     return [*loaded(), *stalled(), *large(), *started(), *equal()]
 
 
@@ -210,19 +218,21 @@ def asked(processes: Processes, service: str, seconds: float) -> list[tuple[int,
 
 
 def path_share(node: Backend, processes: Processes, sender: Sender) -> float:
-    """Of one core: what the node uses more when somebody listens to its path, to the hundredth of a second in five."""
+    """Of one core: what the node uses more when somebody listens to its path; mean of three pairs of five seconds."""
 
     def used() -> float:
         before = node.process.cpu_seconds
         sender.drive(200, 1, 5)
         return (node.process.cpu_seconds - before) / 5
 
-    without = used()
-    hearing = processes.start(LOAD, "hear", "/slam_backend/path", PATH)
-    hearing.wait_for("ready")
-    share = used() - without
-    hearing.wait_for("first", 0)
-    return share
+    more = []
+    for _ in range(3):
+        without = used()
+        hearing = processes.start(LOAD, "hear", "/slam_backend/path", PATH)
+        hearing.wait_for("first")
+        more.append(used() - without)
+        hearing.end()
+    return float(np.mean(more))
 
 
 def draws(processes: Processes) -> list[float]:
@@ -232,19 +242,29 @@ def draws(processes: Processes) -> list[float]:
 
 
 def started() -> list[Row]:
-    """Odometry comes all the while."""
-    took = []
-    for _ in range(3):
+    """Odometry comes all the while; to the node, and to a subscriber that does nothing else."""
+    ours, bare = [], []
+    for _ in range(STARTS):
         with TemporaryDirectory() as folder, Processes(Path(folder)) as processes:
             sending = processes.start(LOAD, "send", 5, "at_once")
             sending.wait_for("matched")
             sending.tell("20 5 20 0")
+            bare.append(first_heard(processes, "/odom", ODOMETRY))
             hearing = processes.start(LOAD, "hear", "/slam_backend/pose", POSE)
             hearing.wait_for("ready")
             begin = time.time()
             Backend(processes, Path(folder) / "data", settings=SOURCES)
-            took.append(float(hearing.wait_for("first ").split()[1]) - begin)
-    return [Row("node start to its first pose, longest of 3", f"{max(took):.2f} s", "", max(took), "<= 3")]
+            ours.append(float(hearing.wait_for("first ").split()[1]) - begin)
+    return [
+        Row(f"node start to its first pose, {name} of {STARTS}; bare subscriber to its first message", f"{of(ours):.2f} s", f"{of(bare):.2f} s", of(ours), limit)
+        for name, of, limit in (("median", median, "<= 3"), ("longest", max, ""))
+    ]  # fmt: skip
+
+
+def first_heard(processes: Processes, topic: str, type_: str) -> float:
+    """Seconds from the start of a process to the first message that it hears."""
+    begin = time.time()
+    return float(processes.start(LOAD, "hear", topic, type_).wait_for("first ").split()[1]) - begin
 
 
 # -- live is replay ----------------------------------------------------------------------------------
