@@ -18,7 +18,8 @@ def command(
         list[str],
         typer.Argument(
             metavar="NAME...",
-            help="pose@<t>, pose@<t>#cov, between@<a>,<b>, velocity@<t>, bias@<t>, landmark/<id>, decision/<factor>; "
+            help="pose@<t>, pose@<t>#cov, between@<a>,<b>, velocity@<t>, bias@<t>, landmark/<id>, earth, place@<t>, place/<id>, "
+            "decision/<factor>; "
             "<t>, <a>, <b>: <sec>.<nsec>, now (the last keyframe) or k<keyframe index>. "
             "map@<t>/ before any of them: as believed at t.",
         ),
@@ -36,7 +37,7 @@ def command(
     """Ask a finished run by name.
 
     Poses are x y z qx qy qz qw of the robot in the map, `between` those of b in a; covariances 6x6 in ROS order, position first,
-    about the axes of the map. Between keyframes the odometry gives the shape. Exit code 1 if one of the names has no answer.
+    about the axes of the map; places latitude, longitude (degrees), altitude (m). Between keyframes the odometry gives the shape. Exit code 1 if one of the names has no answer.
     Earlier beliefs are found by a replay of the run's inputs, which must be where they were.
     """
     from ..core.query import PAST, answers
@@ -65,10 +66,23 @@ def _line(answer: "Answer") -> str:
     """A matrix takes a line for each row."""
     value = _plain(answer)
     if isinstance(value, dict):
-        compared = (
-            f" ({value['statistic']:.6g} against {value['threshold']:.6g})" if value.get("threshold") else ""
-        )
-        return f"{answer.name}: {value['verdict']} by {value['stage']}/{value['reason']}{compared}: {value['detail']}"
+        return f"{answer.name}: {_earth(value) if answer.name.endswith('earth') else _decision(value)}"
     if isinstance(value[0], list):
         return "\n".join([f"{answer.name}:", *(" ".join(f"{x:13.6e}" for x in row) for row in value)])
-    return f"{answer.name}: {' '.join(f'{x:z.6f}' for x in value)}"
+    digits = 9 if "place" in answer.name else 6  # of degrees: 0.1 mm
+    return f"{answer.name}: {' '.join(f'{x:z.{digits}f}' for x in value)}"
+
+
+def _decision(told: dict[str, Any]) -> str:
+    compared = f" ({told['statistic']:.6g} against {told['threshold']:.6g})" if told.get("threshold") else ""
+    return f"{told['verdict']} by {told['stage']}/{told['reason']}{compared}: {told['detail']}"
+
+
+def _earth(told: dict[str, Any]) -> str:
+    """The covariance is for --json."""
+    origin = "unknown" if told["origin"] is None else " ".join(f"{x:.9f}" for x in told["origin"])
+    if told["map_T_earth"] is None:
+        return f"not known yet: {told['why']}; origin {origin}"
+    sure = "" if told["sigma_yaw"] is None else f" (sigma {told['sigma_yaw']:.6f})"
+    numbers = " ".join(f"{x:z.6f}" for x in told["map_T_earth"])
+    return f"the map's x axis points {told['yaw']:.6f} rad{sure} from east; map_T_earth {numbers}; origin {origin}"

@@ -26,6 +26,7 @@ from .errors import BadConfig, SlamError, SolverFailure
 from .firewall.rules import decided
 from .fixes import Compared, Fixes
 from .floor import priors
+from .georeference import Georeference, georeference
 from .graph import (
     DATUM,
     EARTH,
@@ -315,6 +316,7 @@ class Backend:
             self._revision,
             self._states(values, keyframes) if self._imu else States(),
             orientations,
+            self.georeference(),
         )
 
     def _states(self, values: gtsam.Values, keyframes: Sequence[Keyframe]) -> States:
@@ -325,6 +327,19 @@ class Backend:
         ]
         stamps = np.array([k.stamp for k in found], dtype=np.int64)
         return States(stamps, np.array(numbers, dtype=np.float64).reshape(-1, 9))
+
+    def georeference(self) -> Georeference | None:
+        """How the map lies on the earth; None without a source of fixes."""
+        if self._applier.estimate is None or not any(
+            isinstance(source, GnssSource) for source in self.config.sources.values()
+        ):
+            return None
+        part = self.parts.of(EARTH)
+        first = next((k.pose for k in self.timeline.keyframes if self.parts.of(k.pose) == part), None)
+        why = self._waiting.why(EARTH) or ("no fix has been used" if self.origin else "no fix has come")
+        return georeference(
+            self.space, self.estimate, self.origin, first, self.solver.factors.__contains__, why
+        )
 
     def earth(self) -> Array | None:
         """(7,) `map_T_earth`: where the frame east, north, up at `origin` lies in the map; None before that is known."""

@@ -6,6 +6,9 @@
     velocity@<t>        x y z in the map, m/s: of a run with an IMU, linearly between keyframes
     bias@<t>            of the IMU, in its frame: accelerometer x y z (m/s^2), gyroscope x y z (rad/s)
     landmark/<id>       x y z in the map; of a tag with an orientation also qx qy qz qw
+    earth               how the map lies on the earth, or why that is not known yet: see core/georeference.py
+    place@<t>           of the robot: latitude, longitude (degrees WGS-84), altitude (m)
+    place/<id>          of a landmark
     decision/<factor>   the last decision about it
     map@<t>/<name>      any of these, as believed when everything up to t had been applied, and nothing later
 
@@ -21,14 +24,17 @@ import numpy as np
 from .config import OdometrySource
 from .errors import BadConfig, SlamError, SolverFailure
 from .geometry import covariance_to_ros, inverse_of, matrix_of, rotation_of, seven_of_matrix
+from .georeference import Georeference
 from .graph import Motion
 from .keyframes import Track
 from .measurement import Array, format_stamp, parse_stamp
+from .sensors.gnss import geodetic
 from .space import Space
 from .trajectory import Stamps, States, Trajectory, shaped
 
 FORMS = (
-    "pose@<t>", "pose@<t>#cov", "between@<a>,<b>", "velocity@<t>", "bias@<t>", "landmark/<id>", "decision/<factor>", "map@<t>/<any of these>",
+    "pose@<t>", "pose@<t>#cov", "between@<a>,<b>", "velocity@<t>", "bias@<t>", "landmark/<id>", "earth", "place@<t>", "place/<id>",
+    "decision/<factor>", "map@<t>/<any of these>",
 )  # fmt: skip
 PAST = "map@"  # what a name begins with that asks for an earlier belief
 MOMENTS = "<sec>.<nsec>, now or k<keyframe index>"
@@ -65,6 +71,9 @@ class Known(Protocol):
     @property
     def states(self) -> States: ...
 
+    @property
+    def earth(self) -> Georeference | None: ...
+
     def covariance(self, index: int) -> Array:
         """Of a keyframe's pose, at its tangent. SolverFailure if it is not determined."""
         ...
@@ -78,7 +87,7 @@ class Known(Protocol):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Answer:
-    """value: (7,), (6, 6), (3,) or (6,) numbers, or the fields of a decision; None: unknown, and `why`."""
+    """value: (7,), (6, 6), (3,) or (6,) numbers, or the fields of a decision or of the earth; None: unknown, and `why`."""
 
     name: str
     value: Array | Mapping[str, Any] | None
@@ -95,7 +104,7 @@ class Moment:
 
 class Question(NamedTuple):
     name: str
-    kind: str  # pose, cov, between, velocity, bias, landmark or decision
+    kind: str  # pose, cov, between, velocity, bias, landmark, earth, place or decision
     moments: tuple[Moment, ...] = ()
     identifier: str = ""
     past: Moment | None = None  # when it was believed; None: the newest belief
@@ -115,15 +124,17 @@ def question(name: str) -> Question:
 
 def _question(name: str, asked: str) -> Question:
     """asked: the name without its beginning, which says when it was believed."""
+    if asked == "earth":
+        return Question(name, asked)
     kind, slash, identifier = asked.partition("/")
-    if slash and identifier and kind in ("landmark", "decision"):
+    if slash and identifier and kind in ("landmark", "place", "decision"):
         return Question(name, kind, identifier=identifier)
     kind, at, rest = asked.partition("@")
     when, hash_, what = rest.partition("#")
     moments = when.split(",")
     if at and kind == "pose" and len(moments) == 1 and what == ("cov" if hash_ else ""):
         return Question(name, what or kind, (moment_of(name, when),))
-    if at and kind in ("velocity", "bias") and len(moments) == 1 and not hash_:
+    if at and kind in ("velocity", "bias", "place") and len(moments) == 1 and not hash_:
         return Question(name, kind, (moment_of(name, when),))
     if at and kind == "between" and len(moments) == 2 and not hash_:
         return Question(name, kind, tuple(moment_of(name, text) for text in moments))
@@ -236,26 +247,53 @@ def _posed(found: Posed | Unknown) -> Posed:
 
 
 def _value(asked: Question, known: Known, poses: Sequence[Posed]) -> Array | Mapping[str, Any]:
-    if asked.kind == "pose":
-        return poses[0][1]
-    if asked.kind == "cov":
-        return covariance_at(known, *poses[0])
-    if asked.kind in ("velocity", "bias"):
-        if (found := known.states.at(poses[0][0], known.trajectory.stamps)) is None:
-            raise Unknown(
-                f"no velocity and no bias is estimated at {format_stamp(poses[0][0])}: no IMU reaches it"
-            )
-        return found[:3] if asked.kind == "velocity" else found[3:]
-    if asked.kind == "between":
-        a, b = (matrix_of(seven) for _, seven in poses)
-        return seven_of_matrix(inverse_of(a) @ b)
+    if poses:
+        return _when(asked, known, poses)
     if asked.kind == "landmark":
-        if (point := known.landmarks.get(asked.identifier)) is None:
-            raise Unknown(f"there is no landmark '{asked.identifier}' among {len(known.landmarks)}")
-        return np.append(point, known.orientations.get(asked.identifier, ()))
+        return np.append(_landmark(asked, known), known.orientations.get(asked.identifier, ()))
+    if asked.kind == "earth":
+        return _earth(known).as_json()
+    if asked.kind == "place":
+        return _place(_landmark(asked, known), _earth(known))
     if (decision := known.decision(asked.identifier)) is None:
         raise Unknown(f"nothing was decided about '{asked.identifier}' (ids are <source>/<sec>.<nsec>/<n>)")
     return decision
+
+
+def _when(asked: Question, known: Known, poses: Sequence[Posed]) -> Array:
+    """What has a stamp."""
+    stamp, seven = poses[0]
+    if asked.kind == "cov":
+        return covariance_at(known, stamp, seven)
+    if asked.kind == "place":
+        return _place(seven[:3], _earth(known))
+    if asked.kind == "between":
+        a, b = (matrix_of(seven) for _, seven in poses)
+        return seven_of_matrix(inverse_of(a) @ b)
+    if asked.kind in ("velocity", "bias"):
+        if (found := known.states.at(stamp, known.trajectory.stamps)) is None:
+            raise Unknown(f"no velocity and no bias is estimated at {format_stamp(stamp)}: no IMU reaches it")
+        return found[:3] if asked.kind == "velocity" else found[3:]
+    return seven
+
+
+def _landmark(asked: Question, known: Known) -> Array:
+    if (point := known.landmarks.get(asked.identifier)) is None:
+        raise Unknown(f"there is no landmark '{asked.identifier}' among {len(known.landmarks)}")
+    return point
+
+
+def _earth(known: Known) -> Georeference:
+    if known.earth is None:
+        raise Unknown("there is no source of kind gnss: nothing tells how the map lies on the earth")
+    return known.earth
+
+
+def _place(point: Array, earth: Georeference) -> Array:
+    """(3,) m in the map to latitude, longitude, altitude."""
+    if earth.pose is None or earth.origin is None:
+        raise Unknown(f"the map has no place on the earth yet: {earth.why}")
+    return geodetic(earth.on_earth(point), earth.origin)
 
 
 def covariance_at(known: Known, stamp: int, seven: Array) -> Array:

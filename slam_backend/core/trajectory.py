@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from .geometry import inverse_of, matrix_of, seven_of_matrix
+from .georeference import Georeference
 from .measurement import Array
 
 Stamps = NDArray[np.int64]
@@ -215,7 +216,7 @@ class Snapshot:
 
     trajectory: every keyframe in order of stamp. indices: (N,) their indices. odometry: what odometry alone says, from
     the same start, at every sample that is kept. landmarks: (L, 3) in map, with `names`; revision: see Backend. states: by an IMU.
-    orientations: of the landmarks that have one, (4,) qx qy qz qw in map, by name.
+    orientations: of the landmarks that have one, (4,) qx qy qz qw in map, by name. earth: how the map lies there; None without fixes.
     """
 
     trajectory: Trajectory
@@ -226,6 +227,7 @@ class Snapshot:
     revision: int
     states: States = field(default_factory=States)
     orientations: Mapping[str, Array] = field(default_factory=dict)
+    earth: Georeference | None = None
 
     @property
     def stamps(self) -> Stamps:

@@ -28,6 +28,7 @@ class Waiting:
         self._asked: list[int] = []  # stamps at which a source wants a keyframe
         self._images: deque[int] = deque(maxlen=MOST_IMAGES)  # stamps of images
         self._undetermined: dict[int, list[Wait]] = defaultdict(list)
+        self._reasons: dict[int, str] = {}  # why something waited last, by the variable that it waits for
         self._waits = 0  # ever
         self._tallies: dict[str, _Tally] = defaultdict(_Tally)
         self.late: Mapping[str, int] = {}  # ns that are added to the stamps of a source
@@ -94,6 +95,7 @@ class Waiting:
     def wait(self, wait: Wait) -> list[Decision]:
         """Keep a measurement until its variable exists. Of a source of which too many wait in vain, the older half is dropped."""
         self._undetermined[wait.until].append(wait)
+        self._reasons[wait.until] = wait.reason
         m = wait.offer.measurement
         told = Decision(
             m.stamp, wait.offer.id, m.source, "probation", "wait", "undetermined", wait.reason, ends=m.ends
@@ -113,10 +115,15 @@ class Waiting:
     def wake(self, key: int) -> None:
         """A variable exists now, or parts were joined: what waited for it is offered again."""
         self._pending += [wait.offer for wait in self._undetermined.pop(key, ())]
+        self._reasons.pop(key, None)
 
     def for_variable(self, key: int) -> Sequence[Wait]:
         """What waits for it."""
         return self._undetermined.get(key, ())
+
+    def why(self, key: int) -> str:
+        """What was said last of a variable that something waited for, even when the input has ended; empty if nothing did."""
+        return self._reasons.get(key, "")
 
     def landed(self, keys: Iterable[int], ids: Collection[str]) -> list[Offer]:
         """Of what waited for these variables, the measurements that make them: they wait no longer."""

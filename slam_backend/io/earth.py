@@ -15,10 +15,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..core.errors import BadFile, SlamError
+from ..core.errors import BadFile
 from ..core.fixes import Compared
-from ..core.geometry import inverse_of, matrix_of
-from ..core.graph import DATUM, EARTH
 from ..core.measurement import Array, format_stamp, parse_stamp
 
 if TYPE_CHECKING:
@@ -33,35 +31,21 @@ SURE = 3.29  # standard deviations: 99.9 %
 
 
 def on_earth(result: "Result") -> dict[str, Any] | None:
-    """For summary.json; None for a run without fixes. Angles in rad, lengths in m."""
-    backend = result.run.backend
-    if backend.origin is None or (found := backend.compared(result.snapshot)) is None:
+    """For summary.json; None for a run without a source of fixes. Angles in rad, lengths in m."""
+    backend, earth = result.run.backend, result.snapshot.earth
+    if earth is None:
         return None
-    placed = backend.earth()
-    told = {
-        "origin": list(backend.origin),
-        "fixes": {"told": len(found.stamps), "withheld": int(found.withheld.sum())},
-        "nis": nis(result),
-    }
-    if placed is None:
-        why = [
-            d.detail
-            for d in result.decisions
-            if d.reason == "undetermined" and d.source in set(found.sources)
-        ]
-        return {**told, "map_T_earth": None, "why": why[-1] if why else "no fix has been used"}
-    earth_T_map = inverse_of(matrix_of(placed))
-    return {
-        **told,
-        "map_T_earth": placed.tolist(),
-        "yaw": float(np.arctan2(earth_T_map[1, 0], earth_T_map[0, 0])),  # of the map's x axis, from east
-        "sigma_yaw": _sigma_yaw(result),
-        "away": {
+    told = {**earth.as_json(), "fixes": {"told": 0, "withheld": 0}, "nis": nis(result)}
+    if (found := backend.compared(result.snapshot)) is None:
+        return told
+    told["fixes"] = {"told": len(found.stamps), "withheld": int(found.withheld.sum())}
+    if earth.pose is not None:
+        told["away"] = {
             name: _rms(found, chosen, backend.space.name)
             for name, chosen in (("used", ~found.withheld), ("withheld", found.withheld))
             if chosen.any()
-        },
-    }
+        }
+    return told
 
 
 def nis(result: "Result") -> dict[str, Any]:
@@ -123,14 +107,3 @@ def _rms(found: Compared, chosen: Any, space: str) -> Mapping[str, float | None]
     squares: Array = np.mean(away**2, axis=0)
     vertical = float(np.sqrt(squares[2])) if space == "3d" else None
     return {"horizontal": float(np.sqrt(squares[0] + squares[1])), "vertical": vertical}
-
-
-def _sigma_yaw(result: "Result") -> float | None:
-    """rad, of how the newest pose, or where the earth is free the earth itself, is turned; None where that cannot be told."""
-    backend = result.run.backend
-    key = backend.timeline.in_order()[-1].pose if DATUM in backend.solver.factors else EARTH
-    try:
-        covariance = backend.estimate.covariance([key])
-    except SlamError:
-        return None
-    return float(np.sqrt(covariance[2, 2]))

@@ -13,6 +13,7 @@ import numpy as np
 from ..core.config import Config, OdometrySource
 from ..core.difference import Difference
 from ..core.errors import BadConfig, BadFile
+from ..core.georeference import Georeference
 from ..core.measurement import Array, format_stamp, parse_stamp
 from ..core.query import Unknown
 from ..core.space import SPACES, Space
@@ -157,6 +158,17 @@ class FinishedRun:
     @cached_property
     def states(self) -> States:
         return read_states(self.path / STATES)
+
+    @cached_property
+    def earth(self) -> Georeference | None:
+        """None of a run without fixes."""
+        told = self.summary.get("earth")
+        try:
+            return None if told is None else Georeference.from_json(told)
+        except (KeyError, TypeError, ValueError):
+            raise BadFile(
+                f"{self.path / 'summary.json'}: is damaged: it does not say how the map lies on the earth; {AGAIN}"
+            ) from None
 
     @property
     def landmarks(self) -> Mapping[str, Array]:

@@ -9,7 +9,8 @@ from xml.sax.saxutils import escape
 import numpy as np
 
 from ..core.errors import BadConfig, BadFile
-from ..core.geometry import inverse_of, matrix_of
+from ..core.geometry import seven_of_matrix
+from ..core.georeference import Georeference
 from ..core.measurement import Array, format_stamp
 from ..core.sensors.gnss import geodetic
 from .finished import FinishedRun
@@ -45,12 +46,12 @@ def export(run: FinishedRun, target: Path, origin: Origin | None = None) -> str:
     if ending == ".ply":
         write_ply(target, run)
     elif ending in WRITERS:
-        placed = _placed(run) if origin is None else _given(origin)
-        if placed is None:
+        earth = run.earth if origin is None else _given(origin)
+        if earth is None or earth.pose is None:
             raise BadConfig(
                 f"{target}: is in degrees, and the run does not know where it lies on the earth: say so with --origin LAT,LON"
             )
-        WRITERS[ending](target, run, placed)
+        WRITERS[ending](target, run, earth)
     elif target.name.lower().endswith(endings("graph")):
         return convert(run.path / "graph.g2o", target)
     elif target.name.lower().endswith(endings("trajectory")):
@@ -84,37 +85,22 @@ def _vertex(point: Array, colour: Sequence[int]) -> str:
     return " ".join([*map(repr, point.tolist()), *map(str, colour)])
 
 
-class Placed(NamedTuple):
-    """Where the map lies: latitude, longitude (degrees), altitude (m) of an origin, pose: (4, 4) of the map in east, north, up there."""
-
-    origin: tuple[float, float, float]
-    pose: Array
-
-
-def _given(origin: Origin) -> Placed:
+def _given(origin: Origin) -> Georeference:
     c, s = np.cos(np.radians(origin.yaw)), np.sin(np.radians(origin.yaw))
     turned = np.eye(4)
-    turned[:2, :2] = [[c, -s], [s, c]]
-    return Placed(origin[:3], turned)
+    turned[:2, :2] = [[c, s], [-s, c]]
+    return Georeference(origin[:3], seven_of_matrix(turned))
 
 
-def _placed(run: FinishedRun) -> Placed | None:
-    """As the fixes of the run have shown it."""
-    earth = run.summary.get("earth")
-    if earth is None or earth["map_T_earth"] is None:
-        return None
-    return Placed(tuple(earth["origin"]), inverse_of(matrix_of(np.array(earth["map_T_earth"]))))
-
-
-def write_geojson(path: Path, run: FinishedRun, origin: Placed) -> None:
+def write_geojson(path: Path, run: FinishedRun, earth: Georeference) -> None:
     """RFC 7946: the path as a LineString with the stamps of its points, each landmark as a Point."""
-    line = _degrees(run.trajectory.sevens[:, :3], origin)
+    line = _degrees(run.trajectory.sevens[:, :3], earth)
     stamps = [format_stamp(stamp) for stamp in run.trajectory.stamps.tolist()]
     features = (
         [_feature("LineString", line, {"name": "trajectory", "stamps": stamps})] if len(line) > 1 else []
     )
     points = np.array(list(run.landmarks.values())).reshape(-1, 3)
-    for name, place in zip(run.landmarks, _degrees(points, origin), strict=True):
+    for name, place in zip(run.landmarks, _degrees(points, earth), strict=True):
         features.append(_feature("Point", place, {"name": name}))
     path.write_text(json.dumps({"type": "FeatureCollection", "features": features}) + "\n", encoding="utf-8")
 
@@ -126,7 +112,7 @@ def _feature(
     return {"type": "Feature", "geometry": geometry, "properties": properties}
 
 
-def write_kml(path: Path, run: FinishedRun, origin: Placed) -> None:
+def write_kml(path: Path, run: FinishedRun, earth: Georeference) -> None:
     """OGC KML 2.3: the path as a LineString, each landmark as a Point; altitudes only of a run in 3-D, else on the ground."""
     mode = "absolute" if run.config.space == "3d" else "clampToGround"
 
@@ -135,24 +121,24 @@ def write_kml(path: Path, run: FinishedRun, origin: Placed) -> None:
         shape = f"<{kind}><altitudeMode>{mode}</altitudeMode><coordinates>{words}</coordinates></{kind}>"
         return f"<Placemark><name>{escape(name)}</name>{shape}</Placemark>"
 
-    marks = [placemark("trajectory", "LineString", _degrees(run.trajectory.sevens[:, :3], origin))]
+    marks = [placemark("trajectory", "LineString", _degrees(run.trajectory.sevens[:, :3], earth))]
     points = np.array(list(run.landmarks.values())).reshape(-1, 3)
     marks += [
         placemark(name, "Point", [place])
-        for name, place in zip(run.landmarks, _degrees(points, origin), strict=True)
+        for name, place in zip(run.landmarks, _degrees(points, earth), strict=True)
     ]
     head = '<?xml version="1.0" encoding="UTF-8"?>\n<kml xmlns="http://www.opengis.net/kml/2.2"><Document>'
     path.write_text("\n".join([head, *marks, "</Document></kml>", ""]), encoding="utf-8")
 
 
-WRITERS: Mapping[str, Callable[[Path, FinishedRun, Placed], None]] = {
+WRITERS: Mapping[str, Callable[[Path, FinishedRun, Georeference], None]] = {
     ".geojson": write_geojson,
     ".kml": write_kml,
 }
 
 
-def _degrees(points: Array, origin: Placed) -> list[list[float]]:
+def _degrees(points: Array, earth: Georeference) -> list[list[float]]:
     """(N, 3) m in the map to longitude, latitude (degrees), altitude (m)."""
-    on_earth = points @ origin.pose[:3, :3].T + origin.pose[:3, 3]
-    rows = geodetic(on_earth, origin.origin)[:, [1, 0, 2]].tolist()
+    assert earth.origin is not None
+    rows = geodetic(earth.on_earth(points), earth.origin)[:, [1, 0, 2]].tolist()
     return [[round(x, DECIMALS), round(y, DECIMALS), round(z, 4)] for x, y, z in rows]

@@ -15,6 +15,7 @@ from ..core.config import OdometrySource
 from ..core.decisions import as_json
 from ..core.difference import Difference, Jumps, difference
 from ..core.errors import SolverFailure
+from ..core.georeference import Georeference
 from ..core.graph import Decision, keyframe
 from ..core.measurement import Array, format_stamp
 from ..core.query import Unknown
@@ -87,6 +88,10 @@ class Then:
     @property
     def states(self) -> States:
         return self.snapshot.states
+
+    @property
+    def earth(self) -> Georeference | None:
+        return self.snapshot.earth
 
     @property
     def landmarks(self) -> Mapping[str, Array]:

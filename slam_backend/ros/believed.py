@@ -9,6 +9,7 @@ import numpy as np
 from ..core.config import Config, OdometrySource
 from ..core.decisions import as_json
 from ..core.errors import SlamError, SolverFailure
+from ..core.georeference import Georeference
 from ..core.graph import Decision
 from ..core.measurement import Array, format_stamp
 from ..core.query import Known, Unknown
@@ -54,6 +55,10 @@ class Believed:
     @property
     def states(self) -> States:
         return self._snapshot.states
+
+    @property
+    def earth(self) -> Georeference | None:
+        return self._snapshot.earth
 
     @cached_property
     def landmarks(self) -> Mapping[str, Array]:

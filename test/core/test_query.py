@@ -11,6 +11,7 @@ import pytest
 from slam_backend.core.config import OdometrySource
 from slam_backend.core.errors import BadConfig, BadFile, SolverFailure
 from slam_backend.core.geometry import covariance_from_ros
+from slam_backend.core.georeference import Georeference
 from slam_backend.core.measurement import SECOND, Array
 from slam_backend.core.query import FORMS, Answer, Moment, Unknown, answers, question
 from slam_backend.core.space import SPACES
@@ -37,6 +38,7 @@ class World:
     states: States = field(
         default_factory=lambda: States(np.array([SECOND, 2 * SECOND]), np.arange(18.0).reshape(2, 9))
     )
+    earth: Georeference | None = None
 
     @property
     def space(self) -> Any:
@@ -98,7 +100,8 @@ def test_a_moment_is_a_stamp_in_whole_nanoseconds_now_or_a_keyframe(text: str, m
 @pytest.mark.parametrize(
     "name",
     ["", "pose", "pos@1.0", "Pose@now", "pose@1.0,2.0", "pose@now#covariance", "pose@now#", "between@now", "pose/now",
-     "between@1,2,3", "between@1,2#cov", "landmark/", "landmark", "decision/", "velocity@now#cov", "@now", "map@now",
+     "between@1,2,3", "between@1,2#cov", "landmark/", "landmark", "decision/", "velocity@now#cov", "earth@now", "earth#cov", "earth/", "place", "place/",
+     "place@now#cov", "place@1,2", "@now", "map@now",
      "map@now/", "map@1/map@2/pose@now", "map@1/pose", "map@1"],
 )  # fmt: skip
 def test_a_name_of_no_known_form_is_answered_with_the_forms(name: str) -> None:
@@ -255,3 +258,38 @@ def test_velocity_and_bias_are_told_where_an_imu_reaches():
     np.testing.assert_array_equal(bias.value, np.arange(12.0, 18))
     assert beyond.value is None
     assert "no IMU reaches it" in beyond.why
+
+
+NORTH = np.array([10.0, 0, 5, 0, 0, -np.sin(np.pi / 4), np.cos(np.pi / 4)])  # the map's x axis points north
+
+
+def test_the_earth_is_told_with_its_origin_and_places_in_degrees() -> None:
+    """The map begins 10 m south of the origin, and 5 m below it."""
+    world = World(earth=Georeference((48.0, 11.0, 500.0), NORTH, np.eye(6) * 0.01))
+    told = value("earth", world)
+    assert (told["origin"], told["yaw"], told["sigma_yaw"]) == (
+        [48.0, 11.0, 500.0],
+        pytest.approx(np.pi / 2),
+        0.1,
+    )
+    assert told["map_T_earth"] == NORTH.tolist()
+    assert len(told["covariance"]) == 36
+    assert "why" not in told
+    robot, landmark = value("place@now", world), value("place/tag36h11:5", world)
+    for place, north, west, up in ((robot, 3 - 10, 0, -5), (landmark, 1 - 10, 2, 3 - 5)):
+        meters = (place - (48.0, 11.0, 500.0)) * (111_194.0, 74_402.0, 1.0)  # a degree, at 48 north
+        np.testing.assert_allclose(meters, [north, -west, up], atol=0.05)
+
+
+def test_a_map_that_has_no_place_on_the_earth_yet_says_why() -> None:
+    world = World(
+        earth=Georeference((48.0, 11.0, 500.0), why="yaw not yet observable: the fixes reach over 0.2 m")
+    )
+    told = value("earth", world)
+    assert (told["origin"], told["map_T_earth"], told["covariance"]) == ([48.0, 11.0, 500.0], None, None)
+    assert told["why"].startswith("yaw not yet observable")
+    for name in ("place@now", "place/tag36h11:5"):
+        assert one(name, world).why.endswith("yaw not yet observable: the fixes reach over 0.2 m")
+    for name in ("earth", "place@now"):
+        assert "no source of kind gnss" in one(name).why
+    assert "no landmark" in one("place/9", world).why

@@ -7,10 +7,16 @@ import pytest
 
 from slam_backend.cli import main
 from slam_backend.core.errors import BadFile
+from slam_backend.core.measurement import format_stamp
+from slam_backend.core.query import answers
 from slam_backend.core.sensors.gnss import enu
+from slam_backend.io.bags import open_bag
 from slam_backend.io.configfile import load_config
 from slam_backend.io.earth import NAME, read_fixes
+from slam_backend.io.feeder import Feeder
 from slam_backend.io.finished import FinishedRun
+from slam_backend.io.inputs import OWN
+from slam_backend.io.journal import Journal
 from slam_backend.io.maps import export
 from slam_backend.io.replay import replay
 from slam_backend.io.rundir import write_run
@@ -18,6 +24,7 @@ from slam_backend.lab.report import earth, write_report
 from slam_backend.lab.report.subject import Subject
 from slam_backend.lab.sensing import ORIGIN, on_earth
 from slam_backend.lab.simulate import Options, simulate, write_simulation
+from slam_backend.ros.believed import Believed
 
 DRIVE = Options(poses=200, loop_rate=0.0, landmarks=3, gnss_every=4, gnss_sigma=0.3)
 
@@ -69,6 +76,59 @@ def test_the_path_lies_where_the_fixes_have_shown_it(drive, tmp_path, ending):
     expected = made.sevens[:, :3] @ on_earth(DRIVE)[:3, :3].T
     away = enu(places[:, [1, 0, 2]], ORIGIN) - expected
     assert np.sqrt(np.mean(away[:, :2] ** 2)) < 0.3
+
+
+def test_a_living_session_answers_as_its_replay_does(drive, tmp_path):
+    """A worker that reads the journal, and the finished run asked for what was believed then: the same to the bit."""
+    _, result, run = drive
+    config, stamps = result.run.config, result.trajectory.stamps
+    journal = Journal(tmp_path, pytest.fail)
+    table = {source.topic: (name, source.kind) for name, source in config.sources.items()} | dict(OWN)
+    feeder = Feeder(journal, config, table, lambda _: None, pytest.fail)
+    with open_bag(result.run.inputs.paths[0]) as bag:
+        for record in bag.records({source.topic for source in config.sources.values()} | {"/tf_static"}):
+            journal.append(record.topic, record.type, record.data)
+    while (
+        not len((living := feeder.request("snapshot", timeout=60)).stamps) or living.stamps[-1] < stamps[-5]
+    ):
+        pass
+    names = ["earth", "place@k100", f"place/{result.snapshot.names[0]}"]
+    then = f"map@{format_stamp(int(living.stamps[-1]))}/"
+    mine, theirs = answers(names, Believed(living, {}, config)), answers([then + name for name in names], run)
+    assert [numbers(each.value) for each in mine] == [numbers(each.value) for each in theirs]
+    journal.close()
+    feeder.finish(str(tmp_path / "saved"), 60)
+    assert FinishedRun(tmp_path / "saved").earth.as_json() == run.earth.as_json()
+
+
+def test_places_are_where_the_robot_was(drive):
+    made, result, run = drive
+    names = [f"place@k{k}" for k in range(0, 200, 20)]
+    places = np.array([each.value for each in answers(names, run)])
+    away = enu(places, ORIGIN) - made.sevens[::20, :3] @ on_earth(DRIVE)[:3, :3].T
+    assert np.sqrt(np.mean(away[:, :2] ** 2)) < 0.3
+    again = answers(names, Believed(result.snapshot, {}, result.run.config))
+    np.testing.assert_allclose(places, [each.value for each in again], rtol=0, atol=1e-9)
+
+
+def numbers(value):
+    """Of an answer: an array, or the fields of the earth."""
+    fields = value.values() if isinstance(value, dict) else [value]
+    return [float(x) for field in fields for x in np.ravel(field)]
+
+
+def test_what_was_believed_before_the_yaw_was_known_is_that_it_was_not(drive, capsys):
+    _, result, run = drive
+    early, late = (format_stamp(int(result.trajectory.stamps[n])) for n in (5, 150))
+    assert main(["query", str(run.path), f"map@{early}/earth", f"map@{late}/earth", "earth"]) == 0
+    before, after, now = capsys.readouterr().out.splitlines()
+    assert "not known yet: yaw not yet observable: the fixes reach over" in before
+    assert "the map's x axis points" in after
+    assert f"origin {' '.join(f'{x:.9f}' for x in ORIGIN)}" in now
+    assert main(["query", str(run.path), f"map@{early}/place@now", "place@now"]) == 1
+    told = capsys.readouterr()
+    assert "the map has no place on the earth yet: yaw not yet observable" in told.err
+    assert len(told.out.split()[1].split(".")[1]) == 9
 
 
 def test_before_the_yaw_is_known_a_run_says_so(tmp_path, capsys):
