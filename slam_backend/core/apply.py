@@ -30,14 +30,10 @@ class Applier:
         space: Space,
         parts: Parts,
         wake: Callable[[int], None],
-        booked: Callable[[Delta], None] = lambda _: None,
     ) -> None:
-        """wake: called with the key of each new landmark, and with UNTIL_JOINED when two parts become one.
-
-        booked: called with every change that the solver has taken.
-        """
+        """wake: called with the key of each new landmark, and with UNTIL_JOINED when two parts become one."""
         self._solver, self._space, self._parts, self._wake = solver, space, parts, wake
-        self._booked = booked
+        self.booked = _nobody  # called with every change that the solver has taken
         self._verdicts: Mapping[str, Decision] = {}
         self.estimate: Estimate | None = None
         self.sighted: dict[
@@ -109,7 +105,7 @@ class Applier:
         gauges = {saved.parts[f.keys[0]]: f.id for f in saved.factors if f.kind == "gauge"}
         self._parts.restore(saved.parts, gauges)
         self.sighted |= saved.sighted
-        self._booked(delta)
+        self.booked(delta)
 
     def _loose(self, parts: Sequence[int]) -> int | None:
         """Of these the part to move: the latest that only its gauge holds."""
@@ -159,8 +155,8 @@ class Applier:
         keys = {key for factor in added for key in factor.keys if self._parts.of(key) is None}
         self.estimate = estimate
         self._parts.become(parts)
-        self._booked(Delta(remove=tuple(removed)))
-        self._booked(Delta(tuple(factor for factor in added if factor.kind == "loop")))
+        self.booked(Delta(remove=tuple(removed)))
+        self.booked(Delta(tuple(factor for factor in added if factor.kind == "loop")))
         for key in (*sorted(keys), *[UNTIL_JOINED][:joined]):
             self._wake(key)
 
@@ -200,7 +196,7 @@ class Applier:
         gone = tuple(decision.id for decision in incidents if decision.verdict == "removed")
         if not gone:
             return
-        self._booked(Delta(remove=gone))
+        self.booked(Delta(remove=gone))
         held = {key for factor in self._solver.factors.values() for key in factor.keys}
         for key in [key for key in self._parts.all() if not is_pose(key) and key not in held]:
             self._parts.drop(key)
@@ -219,7 +215,7 @@ class Applier:
                 self._parts.release(part)
             if factor.kind in ("loop", "pose") or factor.id in self._verdicts:
                 self.decisions.append(self._verdicts.get(factor.id) or _accepted(factor))
-        self._booked(delta)
+        self.booked(delta)
 
     def _started(self, delta: Delta) -> Callable[[int], Pose]:
         """The first guess of a pose; of one that has been there before, what is believed."""
@@ -231,6 +227,10 @@ class Applier:
             return estimate.pose(key) if guess is None else guess
 
         return pose_of
+
+
+def _nobody(delta: Delta) -> None:
+    """Who keeps no books."""
 
 
 def shift_of(event: Factor, poses: Sequence[Pose], last: bool) -> Pose:

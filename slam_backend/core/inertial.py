@@ -380,6 +380,11 @@ def imu_of(config: Config) -> ImuSource | None:
     return next((source for source in config.sources.values() if isinstance(source, ImuSource)), None)
 
 
+def imu_name(config: Config) -> str:
+    """Of the source that `imu_of` tells; empty where there is none."""
+    return next((name for name, source in config.sources.items() if isinstance(source, ImuSource)), "")
+
+
 def pace_from(config: Config) -> Keyframes:
     """When keyframes are due: where no odometry drives, after some time at the latest. Neither an IMU nor constant velocity knows
     enough of how fast the robot is to tell by the distance.
