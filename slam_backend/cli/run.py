@@ -37,7 +37,7 @@ def command(
         signal.SIG_BLOCK, {signal.SIGINT, signal.SIGTERM}
     )  # until the node is there to hear them
     try:
-        from ..ros.node import main
+        from ..ros.process import main
     except ImportError as error:
         raise MissingExtra(
             f"{error.name or error} is not installed: source a ROS 2 Jazzy install, or pip install 'slam_backend[ros]'"

@@ -5,40 +5,31 @@ condition wakes the executor -> publishers. ~/odometry is made here, from the ne
 so that it never waits for the solver. No callback blocks, and none ends the node.
 """
 
-import gc
-import os
-import signal
-import sys
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from itertools import count
 from pathlib import Path
 from time import monotonic
 from typing import Any
 
-import rclpy
 from rclpy.clock import Clock, ClockType
-from rclpy.executors import SingleThreadedExecutor
 from rclpy.lifecycle import LifecycleState, TransitionCallbackReturn
 from rclpy.parameter import Parameter
-from rclpy.signals import SignalHandlerOptions
 
+from ..core.backend import Update
 from ..core.config import Config, config_from, config_to
 from ..core.errors import SlamError
 from ..core.graph import Decision
-from ..core.inertial import ImuSample
-from ..core.measurement import SECOND, StaticTransform
-from ..core.sensors.odometry import OdometryPose
+from ..core.measurement import SECOND
 from ..io.feeder import Feeder, undisturbed
 from ..io.restore import RUN, Examination
 from ..io.typestore import typestore_of
 from .diagnostics import Diagnostics
 from .inputs import Inputs
 from .intake import Flowing, Intake
+from .locator import Locator
 from .outputs import Outputs
 from .parameters import changed, config_of, declare
-from .pose import Odometer, composed
-from .propagation import Propagator
 from .restoring import Restoring
 from .services import Services
 from .session import Begin, Session, empty
@@ -47,15 +38,9 @@ from .state import State
 from .steadfast import SteadfastNode, explained, survived
 
 LOOK = 0.3  # s between two looks at the graph
-BEAT = 0.1  # s within which a signal is heard
 WATCHED = ("path", "trajectory", "landmarks", "graph")  # outputs that are made from a snapshot
 FAREWELL = 30.0  # s that the worker may take to flush and save at the end
-DEFAULT_ODOM = Config().odom_frame
 AGAIN = 5.0  # s after which the same incident is worth another line
-TRANSPORTS, OVER_UDP = (
-    "FASTDDS_BUILTIN_TRANSPORTS",
-    "UDPv4",
-)  # through shared memory, each process that appears would stop all publishers for 0.3 s (Fast DDS issue 6535)
 STEADY = Clock(clock_type=ClockType.STEADY_TIME)  # timers run whether or not /clock does
 
 
@@ -78,7 +63,8 @@ class BackendNode(SteadfastNode):
         self._outputs: Outputs | None = None
         self._answering: Services | None = None
         self._diagnostics: Diagnostics | None = None
-        self._odometer, self._propagator = Odometer(self.config), Propagator(self.config)
+        self._locator: Locator | None = None
+        self._told: Update | None = None  # the newest that was published
         self._restoring = Restoring(0, self.get_logger().info)
         self._beats: dict[str, Any] = {}
         self._count = count(1)
@@ -161,7 +147,8 @@ class BackendNode(SteadfastNode):
         for part in (self._snapshots, self._answering, self._outputs, self._diagnostics):
             if part is not None:
                 part.close()
-        self._snapshots = self._answering = self._outputs = self._diagnostics = self._intake = None
+        self._snapshots = self._answering = self._outputs = self._diagnostics = None
+        self._intake = self._locator = None
 
     def reset(self, begin: Begin = empty) -> None:
         """A new session: the run so far is saved, its journal set aside, the map starts empty. Takes a while; any thread.
@@ -178,7 +165,7 @@ class BackendNode(SteadfastNode):
         if ended is not None:
             self._end(ended)
         self.state.clear()
-        self._odometer, self._propagator = Odometer(self.config), Propagator(self.config)
+        self._locator = None
         self.session = self._opened(begin, fresh=True)
         self.get_logger().info("a new session has begun")
 
@@ -238,7 +225,8 @@ class BackendNode(SteadfastNode):
         for name in set(config.sources) - set(self.config.sources):
             self.get_logger().info(f"{config.sources[name].topic} is used as {config.sources[name].kind}")
         self.config = config
-        self._odometer, self._propagator = Odometer(config), Propagator(config)
+        if self._outputs is not None:
+            self._locator = Locator(config, self.state, self._outputs)
         if self._intake is not None:
             self._intake.use(config)
         session.work(config)
@@ -301,45 +289,8 @@ class BackendNode(SteadfastNode):
         return True
 
     def moved(self, told: Flowing) -> None:
-        """The driving odometry or the IMU said something sound: where the robot is in the map, at once."""
-        if isinstance(told, StaticTransform):
-            self._propagator.mounted(told)
-        elif isinstance(told, ImuSample):
-            self._carried_on(told)
-        else:
-            self._moved(told)
-
-    def _carried_on(self, sample: ImuSample) -> None:
-        """By the IMU: its rate is that of ~/odometry."""
-        outputs, update = self._outputs, self.state.update
-        carried = self._propagator.carry(sample, update, self.state.covariance)
-        if outputs is None or update is None or carried is None:
-            return
-        outputs.odometry(sample.stamp, carried.seven, carried.covariance, twist=carried.twist)
-        if self._propagator.drives:
-            outputs.map_to_odom(sample.stamp, composed(update.correction, update.origin))
-
-    def _moved(self, odometry: OdometryPose) -> None:
-        """By the odometry; where an IMU carries on from the newest keyframe, that tells ~/odometry."""
-        self._propagator.named(odometry.child)
-        outputs = self._outputs
-        if outputs is None or not self._odometer.goes_on(odometry.stamp):
-            return
-        pose = self._odometer.locate(odometry, self.state.update, self.state.covariance)
-        if pose is None:
-            return
-        if odometry.frame not in ("", self.config.map_frame) and self.config.odom_frame == DEFAULT_ODOM:
-            outputs.odom_frame = odometry.frame
-        if not self._propagator.carries(odometry.stamp):
-            outputs.odometry(
-                odometry.stamp,
-                pose.seven,
-                pose.covariance,
-                odometry.child,
-                odometry.twist,
-                odometry.twist_covariance,
-            )
-        outputs.map_to_odom(odometry.stamp, pose.correction)
+        if self._locator is not None:
+            self._locator.moved(told)
 
     # -- the way out -----------------------------------------------------------------------------
 
@@ -355,7 +306,8 @@ class BackendNode(SteadfastNode):
             return
         if decisions := self.state.untold_decisions():
             outputs.decisions(decisions)
-        if update is not None and self._odometer.is_new(update):
+        if update is not None and update is not self._told:
+            self._told = update
             outputs.pose(update, self.state.covariance)
         snapshot = self.state.take_snapshot()
         if snapshot is not None:
@@ -395,47 +347,3 @@ def _resolved(config: Config, resolve: Callable[[str], str]) -> Config:
     for name in data["sources"]:
         data[name]["topic"] = resolve(data[name]["topic"] or name)
     return config_from(data, "parameters")
-
-
-def main(arguments: list[str] | None = None, config: Config | None = None) -> int:
-    """Run the node until it is told to stop; exit code 2 with one line for a wrong configuration.
-
-    config: what the parameters start from; ROS arguments override it.
-    """
-    os.environ.setdefault(TRANSPORTS, OVER_UDP)
-    wishes: list[int] = []
-    for wish in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(wish, lambda number, _: wishes.append(number))  # more than one changes nothing
-    signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT, signal.SIGTERM})
-    try:
-        rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
-        node = BackendNode(start=config)
-    except Exception as error:  # noqa: BLE001  # rclpy's for malformed arguments are no public classes
-        sys.stderr.write(f"slam-backend: {' '.join(str(error).split())}\n")
-        rclpy.try_shutdown()
-        return 2
-    try:
-        return _run(node, wishes)
-    finally:
-        node.close()
-        node.destroy_node()
-        rclpy.try_shutdown()
-
-
-def _run(node: BackendNode, wishes: Sequence[int]) -> int:
-    executor = SingleThreadedExecutor()
-    executor.add_node(node)
-    node.create_timer(BEAT, lambda: None, clock=STEADY)  # Python hears a signal between two callbacks only
-    if node.config.autostart:
-        if node.trigger_configure() != TransitionCallbackReturn.SUCCESS:
-            return 2  # the reason has been logged
-        node.trigger_activate()
-    gc.collect()
-    gc.freeze()  # modules and message types: to look through them again and again would stop all threads for 50 ms each time
-    while not wishes and rclpy.ok():
-        executor.spin_once()
-    return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -38,7 +38,6 @@ class Odometer:
     def __init__(self, config: Config) -> None:
         self._space = SPACES[config.space]
         self._last = 0
-        self._told: Update | None = None
         self._covariance: tuple[Update, int, Array] | None = None
         driving = config.sources.get(config.driver) if config.driver else None
         self._noise = driving if isinstance(driving, OdometrySource) else OdometrySource()
@@ -49,12 +48,6 @@ class Odometer:
         """Whether this stamp (ns) is newer than all that were told so."""
         new = stamp > self._last
         self._last = max(self._last, stamp)
-        return new
-
-    def is_new(self, update: Update) -> bool:
-        """Whether this update has not been published yet."""
-        new = update is not self._told
-        self._told = update
         return new
 
     def locate(

@@ -98,11 +98,6 @@ def test_only_a_newer_stamp_goes_on() -> None:
     assert [odometer.goes_on(stamp) for stamp in (5, 6, 6, 3, 7)] == [True, True, False, False, True]
 
 
-def test_an_answer_is_new_once() -> None:
-    odometer, first, second = Odometer(QUIET), update(seven(), seven()), update(seven(), seven())
-    assert [odometer.is_new(each) for each in (first, first, second, second)] == [True, False, True, False]
-
-
 def test_where_the_odometry_jumps_nothing_is_told_until_the_worker_knows_what_it_was() -> None:
     """A restart: from then on in the new frame. A lone jump: the next message goes on from before."""
     odometer, correction = Odometer(QUIET), seven(0.0, 7.0)
