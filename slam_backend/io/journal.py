@@ -24,7 +24,7 @@ from ..core.errors import BadFile
 from . import events
 from .events import Event
 from .records import Record
-from .schema import Numbered, connect, insert, open_journal, topics_of
+from .schema import Entry, connect, insert, open_journal, topics_of
 from .storage.sealed import checksum
 
 NAME = "journal.db3"
@@ -62,7 +62,7 @@ class Journal:
         self.committed = self.lost = 0
         self.trouble = ""
         self._failed, self._settings = failed, settings or Journaling()
-        self._queue: deque[Numbered] = deque()
+        self._queue: deque[Entry] = deque()
         self._bytes = 0  # of what is queued
         self._full = False  # since the last commit something has been lost, and that was said
         self.protected: Collection[str] = ()  # topics that others must not crowd out
@@ -106,13 +106,15 @@ class Journal:
             fits = self._has_room(topic, len(data))
             news, self._full = not (fits or self._full), self._full or not fits
             if fits:
-                self._confess()
+                if self._gap is not None:
+                    self._confess(self._gap)
                 self._enqueue(topic, type_, data)
             else:
                 self._lose(1, TOO_LONG)
         if news:
             self._failed(f"{self.path}: memory is full: {topic} is lost; {TOO_LONG}")
-        self._wake.set()
+        if not self._wake.is_set():  # who was woken looks at the queue after it has cleared this
+            self._wake.set()
         return True
 
     def miss(self, lost: Mapping[str, int], why: str) -> None:
@@ -148,7 +150,10 @@ class Journal:
             if not self._queue or self._queue[0][0] > after + 1:
                 return []
             begin = after + 1 - self._queue[0][0]
-            return [Row(*row) for row in islice(self._queue, begin, begin + limit)]
+            return [
+                Row(id_, Record(topic, type_, log_time, data))
+                for id_, topic, type_, log_time, data in islice(self._queue, begin, begin + limit)
+            ]
 
     def close(self, farewell: Event | None = None) -> None:
         """Commit what is queued, and a last word; afterwards the one file holds everything."""
@@ -166,7 +171,7 @@ class Journal:
         self._appended += 1
         self.heard |= topic != events.TOPIC
         self._bytes += len(data)
-        self._queue.append((self._appended, Record(topic, type_, self._newest, data)))
+        self._queue.append((self._appended, topic, type_, self._newest, data))
 
     def _has_room(self, topic: str, size: int) -> bool:
         """What waits may have been applied and must stay: so of a flood the newest are lost, and those of no other source."""
@@ -178,12 +183,11 @@ class Journal:
         after, before, _ = self._gap or (self._newest, 0, "")
         self._gap = after, before + count, why
 
-    def _confess(self) -> None:
+    def _confess(self, gap: tuple[int, int, str]) -> None:
         """Before anything else comes into the queue."""
-        if self._gap is not None:
-            (after, count, why), self._gap = self._gap, None
-            until = max(self._newest + 1, time_ns())
-            self._enqueue(events.TOPIC, events.TYPE, events.encoded(events.gap(after, until, count, why)))
+        self._gap = None
+        until = max(self._newest + 1, time_ns())
+        self._enqueue(events.TOPIC, events.TYPE, events.encoded(events.gap(gap[0], until, *gap[1:])))
 
     # -- the writer's thread -----------------------------------------------------------------------
 
@@ -221,11 +225,12 @@ class Journal:
         for begin in range(0, max(len(batch), 1), size):
             self._commit(batch[begin : begin + size])
         with self._arrival:
-            self._confess()
+            if self._gap is not None:
+                self._confess(self._gap)
         if self._queue:
             self._wake.set()
 
-    def _commit(self, batch: Sequence[Numbered]) -> None:
+    def _commit(self, batch: Sequence[Entry]) -> None:
         """All or nothing."""
         with self._arrival:
             announced = dict(self._announced)
@@ -242,7 +247,7 @@ class Journal:
             }
             for _ in batch:
                 self._queue.popleft()
-            self._bytes -= sum(len(record.data) for _, record in batch)
+            self._bytes -= sum(len(data) for *_, data in batch)
             self._full = False
         with self._grown:
             self.committed += len(batch)

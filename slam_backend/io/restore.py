@@ -16,7 +16,6 @@ from . import events
 from .bags import open_bag
 from .events import Event
 from .journal import NAME
-from .records import Record
 from .schema import connect, insert, open_journal
 from .storage.wal import torn
 
@@ -168,10 +167,10 @@ def salvage(found: Examination) -> str:
 
 def _copy(found: Examination, database: sqlite3.Connection) -> None:
     with open_bag(found.path) as bag:
-        numbered = enumerate(bag.records(), start=1)
+        entries = ((n, r.topic, r.type, r.log_time, r.data) for n, r in enumerate(bag.records(), start=1))
         topics: dict[tuple[str, str], int] = {}
-        while chunk := list(islice(numbered, CHUNK)):
+        while chunk := list(islice(entries, CHUNK)):
             topics = insert(database, topics, chunk, {})
     first, last = found.span or (0, 0)
     gap = events.encoded(events.gap(first, last + 1, 0, "; ".join(found.damage)))
-    insert(database, topics, [(found.records + 1, Record(events.TOPIC, events.TYPE, last + 1, gap))], {})
+    insert(database, topics, [(found.records + 1, events.TOPIC, events.TYPE, last + 1, gap)], {})

@@ -2,10 +2,10 @@
 
 import os
 import sqlite3
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
+from itertools import chain
 from pathlib import Path
 
-from .records import Record
 from .storage.sealed import VERSION, checksum
 from .typestore import typestore_of
 
@@ -28,7 +28,13 @@ SEAL = (
 )
 UNANNOUNCE = "DELETE FROM topics WHERE name = ? AND id NOT IN (SELECT DISTINCT topic_id FROM messages)"
 
-Numbered = tuple[int, Record]  # with the id of its row
+MANY = 50  # rows in one statement: each costs a way through SQLite's machine, and through the GIL
+MESSAGE = "INSERT INTO messages VALUES (?, ?, ?, ?)"
+CHECKSUM = "INSERT INTO checksums VALUES (?, ?)"
+
+Entry = tuple[
+    int, str, str, int, bytes
+]  # a record and the id of its row: id, topic, type, log time (ns), data
 Topics = dict[tuple[str, str], int]  # (name, type) -> id of its row
 
 
@@ -73,23 +79,33 @@ def topics_of(database: sqlite3.Connection) -> Topics:
 
 
 def insert(
-    database: sqlite3.Connection, topics: Topics, batch: Iterable[Numbered], announced: Mapping[str, str]
+    database: sqlite3.Connection, topics: Topics, batch: Iterable[Entry], announced: Mapping[str, str]
 ) -> Topics:
     """In the transaction that is open. topics: that the file has; returns those that it has then."""
     known, rows, sums = dict(topics), [], []
-    for id_, record in batch:
-        key = record.topic, record.type
-        if key not in known:
-            database.execute(UNANNOUNCE, key[:1])
-            known = topics_of(database) | {key: _add_topic(database, *key)}
-        rows.append((id_, known[key], record.log_time, record.data))
-        sums.append((id_, checksum(*key, record.log_time, record.data)))
+    for id_, name, type_, log_time, data in batch:
+        topic = known.get((name, type_))
+        if topic is None:
+            database.execute(UNANNOUNCE, (name,))
+            topic = _add_topic(database, name, type_)
+            known = topics_of(database)
+        rows.append((id_, topic, log_time, data))
+        sums.append((id_, checksum(name, type_, log_time, data)))
     for name, type_ in announced.items():
         if not any(name == there for there, _ in known):
             known[name, type_] = _add_topic(database, name, type_)
-    database.executemany("INSERT INTO messages VALUES (?, ?, ?, ?)", rows)
-    database.executemany("INSERT INTO checksums VALUES (?, ?)", sums)
+    _fill(database, MESSAGE, rows)
+    _fill(database, CHECKSUM, sums)
     return known
+
+
+def _fill(database: sqlite3.Connection, one: str, rows: Sequence[tuple[object, ...]]) -> None:
+    """one: the statement for one row. In groups of the same size, so that SQLite has each statement prepared already."""
+    whole = len(rows) - len(rows) % MANY
+    many = one + f", {one.partition('VALUES ')[2]}" * (MANY - 1)
+    for begin in range(0, whole, MANY):
+        database.execute(many, tuple(chain.from_iterable(rows[begin : begin + MANY])))
+    database.executemany(one, rows[whole:])
 
 
 def _add_topic(database: sqlite3.Connection, name: str, type_: str) -> int:

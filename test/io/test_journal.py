@@ -21,6 +21,7 @@ from slam_backend.io.cdr import Decoder
 from slam_backend.io.encode import encode_odometry
 from slam_backend.io.inputs import OWN
 from slam_backend.io.journal import Journal, JournalReader
+from slam_backend.io.schema import MANY
 from slam_backend.io.typestore import typestore_of
 
 ODOMETRY = "nav_msgs/msg/Odometry"
@@ -102,6 +103,20 @@ def test_many_threads_append_and_nothing_is_lost(journal) -> None:
         assert [r.record.data for r in found if r.record.topic == f"/odom{k}"] == [
             message(n) for n in range(500)
         ]
+
+
+@pytest.mark.parametrize("count", [1, MANY - 1, MANY, 2 * MANY + 7])
+def test_however_many_come_in_one_commit_each_is_there_and_whole(tmp_path, complaints, count) -> None:
+    journal = Journal(tmp_path, complaints.append, Journaling(commit_delay=5.0))
+    for n in range(count):
+        journal.append("/loops" if n % 3 else "/odom", ODOMETRY, message(n))
+    assert (journal.waiting, journal.committed) == (count, 0)
+    journal.close()
+    found = rows(journal.path)
+    assert [row.id for row in found] == list(range(1, count + 1))
+    assert [(row.record.topic, row.record.data) for row in found] == [
+        ("/loops" if n % 3 else "/odom", message(n)) for n in range(count)
+    ]
 
 
 def test_it_is_an_ordinary_bag_of_one_file(journal) -> None:
