@@ -1,6 +1,7 @@
 """What a run directory says about the earth."""
 
 import json
+from time import sleep
 
 import numpy as np
 import pytest
@@ -88,10 +89,10 @@ def test_a_living_session_answers_as_its_replay_does(drive, tmp_path):
     with open_bag(result.run.inputs.paths[0]) as bag:
         for record in bag.records({source.topic for source in config.sources.values()} | {"/tf_static"}):
             journal.append(record.topic, record.type, record.data)
-    while (
-        not len((living := feeder.request("snapshot", timeout=60)).stamps) or living.stamps[-1] < stamps[-5]
-    ):
-        pass
+    living = feeder.request("snapshot", timeout=60)
+    while not len(living.stamps) or living.stamps[-1] < stamps[-5]:
+        sleep(0.1)
+        living = feeder.request("snapshot", timeout=60)
     names = ["earth", "place@k100", f"place/{result.snapshot.names[0]}"]
     then = f"map@{format_stamp(int(living.stamps[-1]))}/"
     mine, theirs = answers(names, Believed(living, {}, config)), answers([then + name for name in names], run)
