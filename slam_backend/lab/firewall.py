@@ -26,8 +26,17 @@ STAGES = {
     "imu": "From one keyframe to the next, by the IMU",
     "coast": "Where nothing measures the motion",
     "*": "Where it lands",
+    "relative": "Relative poses",
+    "landmark": "Landmarks and tags",
+    "placing": "Landmarks seen by range or bearing alone",
+    "association": "Landmarks without ids",
+    "quarantine": "Landmarks beside their own history",
+    "budget": "What a landmark may cost",
+    "pixels": "Pixels of a frame",
+    "points": "Points in the graph",
     "gnss": "Fixes on the earth",
     "doubt": "Fixes beside what is expected of them",
+    "calibration": "Constants of the sensors",
 }
 
 

@@ -152,7 +152,7 @@ class Associator:
             m = offer.measurement
             assert isinstance(m, LandmarkObservation)
             if m.form in PLACELESS:
-                raise Unusable(m.form, f"a {m.form} alone cannot be associated: give it an id")
+                raise Unusable("nameless", f"a {m.form} alone cannot be associated: give it an id")
             point, noise = as_point(m, mount, placed.motion, context, self._config)
             sightings.append(Sighting(offer, point, noise))
         return Scan(placed.keyframe, context.pose(placed.keyframe.pose), sightings)

@@ -204,6 +204,82 @@ RULES: Mapping[str, Rule] = {
     "check/landmark_kind": Rule(
         "error", "there is no landmark of this kind", "send position, bearing and range, or bearing: see docs/messages.md"
     ),
+    "landmark/not_finite": Rule(
+        "warn", "a planar map has a tilted sensor, and the sighting lacks an axis, or a covariance of all of them",
+        "send x, y and z with their covariance, of a tag all six axes",
+    ),
+    "landmark/steep": Rule(
+        "warn", "a planar map needs the yaw of a tag, and its x axis is not level", "set 'orientation: false', or mount the tag upright"
+    ),
+    "landmark/orientation": Rule(
+        "warn", "a landmark that has an orientation is seen without one", "send one form of sighting for each landmark"
+    ),
+    "landmark/range": Rule(
+        "warn", "the landmark is where the robot is", "drop returns without an echo; see that the mounting of the sensor is right", 0.0, "m"
+    ),
+    "landmark/quarantined": Rule(
+        "warn", "another sighting of a landmark that has been taken out", "see quarantine/moved, moving and duplicate"
+    ),
+    "placing/undetermined": Rule(
+        "note", "the sightings of a landmark seen by range or bearing alone do not place it yet", "drive round it; the first path is too straight"
+    ),
+    "placing/ambiguous": Rule(
+        "note", "two places fit the sightings of a landmark", "leave the straight line: it tells one side from the other",
+    ),
+    "wait/undetermined": Rule(
+        "note", "it waits for what it needs: more sightings of its landmark, the yaw of the earth, a joint of two parts of the map",
+        "nothing at first: drive on; at the end it says what was missing",
+    ),
+    "association/nameless": Rule(
+        "error", "a bearing or a range alone cannot be associated", "give its landmarks ids, or send positions"
+    ),
+    "association/ambiguous": Rule(
+        "note", "too close to a landmark to be new, and not of it", "if it is often so: state larger sigmas for sightings or odometry",
+        None, "", "<landmark>.gate",
+    ),
+    "association/unconfirmed": Rule("note", "seen too rarely to be a landmark", "nothing: people and leaves end so", None, "", "<landmark>.confirmations"),
+    "quarantine/moved": Rule(
+        "warn", "the landmark stands elsewhere now", "landmarks must not move: use other tags, or leave this one out"
+    ),
+    "quarantine/moving": Rule("warn", "the landmark does not stand still", "leave it out: it rides on something"),
+    "quarantine/duplicate": Rule("warn", "there are two landmarks of that name", "give each its own number: look for a tag printed twice"),
+    "budget/combined": Rule(
+        "note", "with other sightings from its keyframe it became one factor", "nothing is lost", None, "", "budget.sightings"
+    ),
+    "budget/dropped": Rule(
+        "note", "of too many sightings of a landmark one that says least", "for more certainty raise the budget", None, "", "budget.sightings"
+    ),
+    "pixels/no_baseline": Rule("error", "stereo pixels without a baseline", "set 'camera.baseline', or use the right camera's info"),
+    "pixels/raw_stereo": Rule("error", "stereo pixels of raw images", "send pixels of rectified images, and set 'image: rectified'"),
+    "pixels/id": Rule("warn", "the id of a feature is no whole number", "give each track a number of its own"),
+    "pixels/not_finite": Rule("warn", "a pixel or its sigma is NaN, infinite or not positive", "drop features that are lost"),
+    "pixels/absurd": Rule("warn", "a pixel or a sigma that no camera has", "pixels and their sigmas must be in pixels"),
+    "pixels/behind": Rule(
+        "warn", "the feature lies further right in the right image: behind the cameras", "see that u is of the left image and ur of the right"
+    ),
+    "pixels/twice": Rule("warn", "a feature is in the frame twice", "send each id once in a frame"),
+    "pixels/second_frame": Rule("note", "its keyframe has a frame of this source", "nothing; one frame for each keyframe is used"),
+    "pixels/outlier": Rule(
+        "note", "the feature is not where its point is seen from there", "if it is often so: look at the calibration, and for things that move"
+    ),
+    "pixels/disagrees": Rule(
+        "note", "no point is where all sightings of the feature see it", "if it is often so: look at the calibration, and for things that move"
+    ),
+    "points/outlier": Rule("note", "a sighting in the graph does not fit its point any more; taken out", "nothing, if it is rare"),
+    "points/behind": Rule("note", "a point has come to lie behind a camera that saw it; taken out", "nothing, if it is rare"),
+    "calibration/unobservable": Rule(
+        "note", "a constant of a sensor cannot be told from the data yet; it stays as configured", "move in more ways, or give it: leave it out of 'calibrate'",
+    ),
+    "calibration/unsolvable": Rule(
+        "warn", "constants and graph could not be solved together; all stay as they are", "calibrate fewer constants at once"
+    ),
+    "relative/one_keyframe": Rule(
+        "note", "both ends of a relative pose land at the same keyframe", "nothing; 'keyframe: true' makes keyframes at its ends"
+    ),
+    "relative/overlap": Rule(
+        "error", "one end of a relative pose lies in the map that is continued, and is no keyframe of it",
+        "name a stamp of its keyframes: `query RUN pose@k<n>`, `~/list keyframes`",
+    ),
     "*/no_camera": Rule(
         "error", "no calibration of the camera", "set 'camera' of the source, or 'info_topic' to that of its CameraInfo",
     ),

@@ -121,4 +121,4 @@ def test_a_bearing_without_an_id_is_refused(drive: Simulation) -> None:
             break
         engine.add(item)
     decisions = [d for update in engine.finish() for d in update.decisions]
-    assert [d.reason for d in decisions if d.stage == "association"] == ["bearing"]
+    assert [d.reason for d in decisions if d.stage == "association"] == ["nameless"]
