@@ -9,6 +9,7 @@ from ..core.errors import BadConfig, BadMessage
 from ..core.measurement import Array, Measurement
 from ..core.sensors.cloud import columns
 from ..core.sensors.gnss import DECODERS as GNSS
+from ..core.sensors.imu import DECODERS as IMU
 from ..core.sensors.odometry import DECODERS as ODOMETRY
 from ..core.sensors.odometry import TRANSFORMS, OdometryPose, decode_transforms
 from .bags import Bag
@@ -32,6 +33,13 @@ TRUTH = (
 )  # parts of names of topics that must not become input
 
 
+ASIDE = (  # what is said of an IMU
+    "an IMU is used where a configuration names it under 'sources' (kind: imu, space: 3d): its mounting and noise must be told"
+)
+UNASKED = " (an IMU or absolute poses do so where a configuration names them under 'sources')"
+COASTING = "fixes tell heights; between them the robot is taken to go on at constant velocity"
+
+
 def discover(inputs: BagInputs | GraphInput) -> tuple[Config, list[str]]:
     """The configuration, and lines that say what was chosen and what was left aside. BadConfig when nothing drives."""
     if isinstance(inputs, GraphInput):
@@ -40,16 +48,16 @@ def discover(inputs: BagInputs | GraphInput) -> tuple[Config, list[str]]:
     sources: dict[str, dict[str, Any]] = {}
     for topic, kind in kinds.items():
         sources[name_of(topic)] = {"kind": kind, "topic": topic}
-    if not any(kind in ("odometry", "relative") for kind in kinds.values()):
+    if not any(kind in ("odometry", "relative", "gnss") for kind in kinds.values()):
         where = ", ".join(str(path) for path in inputs.paths)
         has = (
             ", ".join(f"{name} ({topic.type})" for name, topic in inputs.topics.items()) or "no topics at all"
         )
         raise BadConfig(
-            f"{where}: no odometry and no relative poses in it that could drive the keyframes; it has {has}"
+            f"{where}: no odometry, relative poses or fixes in it that could drive the keyframes{UNASKED}; it has {has}"
         )
-    space = "2d" if _planar(inputs, kinds) else "3d"
-    notes.append(f"space {space}: the poses {'lie in a plane' if space == '2d' else 'leave the plane'}")
+    space, why = _space(inputs, kinds)
+    notes.append(f"space {space}: {why}")
     return config_from({"space": space, "sources": list(sources), **sources}), notes
 
 
@@ -79,7 +87,9 @@ def _kinds_of(inputs: BagInputs) -> tuple[dict[str, str], list[str]]:
             notes.append(f"{topic} is taken for ground truth and left aside")
             continue
         kind = kind_of(first, bag.typestore)
-        if kind is not None:
+        if kind == "imu":
+            notes.append(f"{topic} is left aside: {ASIDE}")
+        elif kind is not None:
             kinds[topic] = kind
     odometries = [topic for topic, kind in kinds.items() if kind == "odometry"]
     best = max(
@@ -97,7 +107,7 @@ def _kinds_of(inputs: BagInputs) -> tuple[dict[str, str], list[str]]:
 
 def _first_messages(inputs: BagInputs) -> dict[str, tuple[Any, Bag]]:
     first: dict[str, tuple[Any, Bag]] = {}
-    types = {*ODOMETRY, *GNSS, "sensor_msgs/msg/PointCloud2"}
+    types = {*ODOMETRY, *GNSS, *IMU, "sensor_msgs/msg/PointCloud2"}
     for bag in inputs.bags:
         for topic, what in bag.topics.items():
             if what.type in types and topic not in first and topic != TF_STATIC:
@@ -109,7 +119,7 @@ def _first_messages(inputs: BagInputs) -> dict[str, tuple[Any, Bag]]:
 
 
 def kind_of(record: Record, typestore: Any) -> str | None:
-    """What a topic is, from its first message; None when it is nothing that can be used."""
+    """What a topic is, from its first message; None when it is nothing that can be used. An IMU is used only if a configuration wants it."""
     try:
         message: Any = typestore.deserialize_cdr(record.data, record.type)
         if record.type == TRANSFORMS:
@@ -118,8 +128,8 @@ def kind_of(record: Record, typestore: Any) -> str | None:
         return None
     if record.type == "sensor_msgs/msg/PointCloud2":
         return _kind_of_cloud(message)
-    if record.type in GNSS:
-        return "gnss"
+    if record.type not in ODOMETRY:  # a Range is as a rule a sonar's
+        return "gnss" if record.type in GNSS else "imu" if record.type in IMU else None
     if "@" in message.header.frame_id:
         return "relative"
     is_tag = ":" in getattr(message, "child_frame_id", "")  # family:number
@@ -139,13 +149,15 @@ def _kind_of_cloud(message: Any) -> str | None:
     return "landmark" if "id" in names and told else None
 
 
-def _planar(inputs: BagInputs, kinds: dict[str, str]) -> bool:
-    """Whether z, roll and pitch are exactly zero in the first poses of the source that drives."""
-    driving = next((t for t, k in kinds.items() if k == "odometry"), None) or next(
-        t for t, k in kinds.items() if k == "relative"
-    )
-    poses = list(islice(_poses(inputs, driving), ENOUGH))
-    return bool(poses) and all(z == 0 and qx == 0 and qy == 0 for _, _, z, qx, qy, *_ in poses)
+def _space(inputs: BagInputs, kinds: dict[str, str]) -> tuple[str, str]:
+    """2d where z, roll and pitch are exactly zero in the first poses of the source that drives; and why, in words."""
+    driving = [topic for kind in ("odometry", "relative") for topic, k in kinds.items() if k == kind]
+    if not driving:
+        return "3d", COASTING
+    poses = list(islice(_poses(inputs, driving[0]), ENOUGH))
+    if poses and all(z == 0 and qx == 0 and qy == 0 for _, _, z, qx, qy, *_ in poses):
+        return "2d", "the poses lie in a plane"
+    return "3d", "the poses leave the plane"
 
 
 def _poses(inputs: BagInputs, topic: str) -> Iterator[Array]:

@@ -25,7 +25,7 @@ from ..core.sensors.odometry import OdometryPose
 from ..core.sensors.pixels import PixelFrame
 from ..core.sensors.relative import RelativePose
 from ..core.space import SPACES
-from .discover import discover, is_truth
+from .discover import UNASKED, discover, is_truth
 from .gravity import sideways
 from .inputs import OWN, TF_STATIC, BagInputs, GraphInput, open_inputs
 from .replay import settled_stream
@@ -103,7 +103,7 @@ def examine(paths: Sequence[Path | str], config: Config | None = None) -> Checku
                 config, notes = discover(inputs)
             except BadConfig:
                 config = None
-                advice = "record odometry (nav_msgs/Odometry, or odom -> base on /tf), or relative poses"
+                advice = f"record odometry (nav_msgs/Odometry, or odom -> base on /tf), relative poses or fixes{UNASKED}"
                 findings.append(Finding("error", "nothing in it can drive the keyframes", advice))
         watch = _Watch(config)
         if config is not None:

@@ -22,6 +22,11 @@ SILENT = 3.0  # s without a message after which a source is silent
 FRESH = 10.0  # s for which an incident is the news
 BEHIND = 2000  # rows that the worker has yet to read, beyond which it is behind
 
+CORRECTIONS = (
+    "correction_m",
+    "correction_rad",
+)  # of an odometry; nobody has published one that fixes or edges make
+
 
 class Diagnostics:
     def __init__(self, node: Any, state: State) -> None:
@@ -43,7 +48,10 @@ class Diagnostics:
         static = inputs.flows.get(self._node.resolve_topic_name(TF_STATIC))
         if static is not None and static.incompatible:
             statuses.append(_status(f"{name}: {TF_STATIC}", ERROR, static.incompatible, {"qos": static.qos}))
-        statuses.append(_status(f"{name}: solver", *self._worker(feeder, journal)))
+        level, message, values = self._worker(feeder, journal)
+        if config.driver is not None and config.sources[config.driver].kind not in ("odometry", "imu"):
+            values = {key: value for key, value in values.items() if key not in CORRECTIONS}
+        statuses.append(_status(f"{name}: solver", level, message, values))
         stamp = self._node.get_clock().now().nanoseconds
         self._publisher.publish(encode_diagnostics(stamp, statuses))
 

@@ -7,7 +7,7 @@ from typing import Any
 from ..core.config import Config, config_from, config_to
 from ..core.errors import BadConfig
 from ..core.sensors.odometry import TRANSFORMS
-from ..io.discover import is_truth, kind_of, name_of
+from ..io.discover import ASIDE, is_truth, kind_of, name_of
 from ..io.records import Record
 
 PATIENCE: Mapping[
@@ -16,7 +16,7 @@ PATIENCE: Mapping[
     ("odometry", "nav_msgs/msg/Odometry"): 0.0,
     ("odometry", TRANSFORMS): 3.0,
 }
-LONGEST = 6.0  # s; of all others: poses of an unknown kind, and relative poses without odometry
+LONGEST = 6.0  # s; of all others: poses of an unknown kind, and relative poses or fixes without odometry
 
 
 class Finder:
@@ -63,6 +63,9 @@ class Finder:
             if record.type != TRANSFORMS:  # those may hold the odometry later
                 self.unused[topic] = "it holds nothing that could be used"
             return False
+        if kind == "imu":
+            self.unused[topic] = ASIDE
+            return False
         self._kinds[topic], self._types[topic], self._since[topic] = kind, record.type, monotonic()
         return True
 
@@ -70,7 +73,7 @@ class Finder:
         kind = self._kinds[topic]
         if config.driver is not None and kind != "odometry":
             return True
-        if kind in ("landmark", "pose", "gnss"):
+        if kind in ("landmark", "pose"):
             return False
         return monotonic() - self._since[topic] >= PATIENCE.get((kind, self._types[topic]), LONGEST)
 

@@ -9,6 +9,8 @@ from slam_backend.io.bags import write_bag
 from slam_backend.io.discover import discover
 from slam_backend.io.encode import (
     encode_cloud,
+    encode_fix,
+    encode_imu,
     encode_odometry,
     encode_pose_with_covariance,
     encode_transforms,
@@ -30,6 +32,16 @@ def odometry(n, topic="/odom", frames=("odom", "base"), z=0.0):
 def pose(n, topic, frame):
     data = encode_pose_with_covariance((n + 1) * SECOND, frame, np.array([n, 0, 0, 0, 0, 0, 1.0]), ZERO[0])
     return Record(topic, COVARIANCE, n, data)
+
+
+def fix(n):
+    data = encode_fix((n + 1) * SECOND, "gps", (48.0, 9.0 + n * 1e-5, 400.0), np.eye(3))
+    return Record("/fix", "sensor_msgs/msg/NavSatFix", n, data)
+
+
+def imu(n):
+    data = encode_imu((n + 1) * SECOND, "imu", (0, 0, 0), (0, 0, 9.81), np.zeros(9), np.zeros(9))
+    return Record("/imu", "sensor_msgs/msg/Imu", n, data)
 
 
 def cloud(n, topic, *names):
@@ -100,13 +112,33 @@ def test_the_plane_is_told_from_exact_zeros(found, z, space):
 
 
 def test_a_bag_that_nothing_can_drive_is_said_with_its_topics(found):
-    with pytest.raises(BadConfig, match=r"no odometry and no relative poses .* it has /trees \(sensor_msgs"):
+    with pytest.raises(
+        BadConfig, match=r"no odometry, relative poses or fixes .* it has /trees \(sensor_msgs"
+    ):
         found(cloud(0, "/trees", "id", "x", "y"))
 
 
 def test_relative_poses_alone_drive(found):
     config, _ = found(odometry(2, "/steps", ("base@1.000000000", "base@2.000000000")))
     assert config.driver == "steps"
+
+
+def test_fixes_drive_where_there_is_no_odometry_and_an_imu_is_left_aside_with_the_reason(found):
+    """How an IMU is mounted, and how good it is, cannot be told from its messages."""
+    config, notes = found(
+        *(each(n) for n in range(5) for each in (fix, imu)), cloud(1, "/trees", "id", "x", "y")
+    )
+    assert (config.driver, config.space, list(config.sources)) == ("fix", "3d", ["fix", "trees"])
+    assert any("/imu is left aside" in note and "kind: imu" in note for note in notes)
+    assert any("constant velocity" in note for note in notes)
+    config, _ = found(odometry(0), fix(1), imu(2))
+    assert (config.driver, set(config.sources)) == ("odom", {"odom", "fix"})
+
+
+def test_an_imu_or_absolute_poses_alone_drive_only_where_that_is_asked(found):
+    for records in ([imu(0)], [pose(0, "/initialpose", "map")]):
+        with pytest.raises(BadConfig, match="where a configuration names them under 'sources'"):
+            found(*records)
 
 
 def test_without_an_odometry_topic_the_pair_odom_to_base_on_tf_serves(found):
@@ -123,5 +155,5 @@ def test_without_an_odometry_topic_the_pair_odom_to_base_on_tf_serves(found):
 
 
 def test_transforms_of_other_pairs_are_no_odometry(found):
-    with pytest.raises(BadConfig, match="no odometry and no relative poses"):
+    with pytest.raises(BadConfig, match="no odometry, relative poses or fixes"):
         found(*(transforms(n, "map", "odom") for n in range(9)))

@@ -13,6 +13,8 @@ from slam_backend.core.measurement import SECOND
 from slam_backend.io import events
 from slam_backend.io.encode import (
     encode_cloud,
+    encode_fix,
+    encode_imu,
     encode_odometry,
     encode_pose_with_covariance,
     encode_transforms,
@@ -43,6 +45,11 @@ IN_MAP = Record(
 TAGS = Record(
     "/tags", "sensor_msgs/msg/PointCloud2", 0,
     encode_cloud(START, "camera", {name: np.ones(2) for name in ("id", "x", "y", "z")}),
+)  # fmt: skip
+FIX = Record("/fix", "sensor_msgs/msg/NavSatFix", 0, encode_fix(START, "gps", (48.0, 9.0, 400.0), np.eye(3)))
+IMU = Record(
+    "/imu", "sensor_msgs/msg/Imu", 0,
+    encode_imu(START, "imu", (0, 0, 0), (0, 0, 9.81), np.zeros(9), np.zeros(9)),
 )  # fmt: skip
 SCAN = replace(TAGS, topic="/scan", data=encode_cloud(START, "lidar", {name: np.ones(2) for name in "xyz"}))
 
@@ -151,6 +158,24 @@ def test_relative_poses_drive_when_nothing_else_does_and_give_way(seen, impatien
     assert seen.config.driver == "loops"
     assert seen.look(ODOMETRY) == {"/loops": "relative", "/odom": "odometry"}
     assert seen.config.driver == "odom"
+
+
+def test_fixes_drive_when_nothing_else_does_and_give_way(seen, impatient) -> None:
+    assert seen.look(FIX, TAGS) == {"/fix": "gnss", "/tags": "landmark"}
+    assert seen.config.driver == "fix"
+    assert seen.look(ODOMETRY) == {"/fix": "gnss", "/tags": "landmark", "/odom": "odometry"}
+    assert seen.config.driver == "odom"
+
+
+def test_fixes_wait_a_while_for_odometry(seen) -> None:
+    assert seen.look(FIX, FIX) == {}
+    assert seen.look(ODOMETRY) == {"/odom": "odometry", "/fix": "gnss"}
+
+
+def test_an_imu_is_never_taken_for_odometry(seen, impatient) -> None:
+    assert seen.look(IMU, IMU) == {}
+    assert "where a configuration names it" in seen.finder.unused["/imu"]
+    assert not seen.wants(IMU)
 
 
 def test_a_topic_that_is_called_like_a_setting_is_a_source_all_the_same(seen) -> None:

@@ -82,7 +82,7 @@ def factors(
     fixes = [*(wait.offer for wait in context.waiting(until)), *window]
     found = _first_guess(_sights(fixes, b, context, config), context)
     if isinstance(found, str):
-        return each(window, "gnss", lambda offer: Wait(offer, until, found))
+        return each(window, "gnss", lambda offer: _held(offer, until, found, context))
     if apart:
         return _joined(found, window, b, context)
     gauge = context.gauge(b.pose)
@@ -91,6 +91,14 @@ def factors(
     delta = each(window, "gnss", lambda offer: _factor(offer, context, config))
     remove = () if gauge is None else (gauge,)
     return replace(delta, add=(*laid, *delta.add), remove=remove, values={EARTH: found})
+
+
+def _held(offer: Offer, until: int, why: str, context: Context) -> Wait:
+    """It waits, unless it will never be of use: an antenna that nobody has mounted."""
+    m = offer.measurement
+    assert isinstance(m, Fix)
+    context.mount(m.frame)
+    return Wait(offer, until, why)
 
 
 def _joined(guess: Pose, window: Sequence[Offer], b: Keyframe, context: Context) -> Delta:
