@@ -6,7 +6,6 @@ snapshot over a pipe; there a thread answers, with arrays that are written as th
 
 import math
 import multiprocessing
-import os
 import pickle
 import signal
 import threading
@@ -28,7 +27,6 @@ from rclpy.task import Future
 from ..core.errors import BadMessage, SlamError
 from ..core.measurement import SECOND, Array, parse_stamp, stamp_of
 from ..core.trajectory import Snapshot, Stamps
-from ..io.historian import NICE
 
 MOST = 50_000  # resampled poses in one answer
 PATIENCE = 0.2  # s between two looks at whether to stop
@@ -224,7 +222,6 @@ class Server:
 def serve(pipe: Connection, service: str, namespace: str, frame: str) -> None:
     """The process: answers until the node's end of the pipe is closed."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the node's affair: the pipe will tell
-    os.nice(NICE)
     context = rclpy.Context()
     rclpy.init(context=context, signal_handler_options=SignalHandlerOptions.NO)
     name = "_" + service.strip("/").replace("/", "_")  # of its own, and hidden by the underscore
