@@ -25,7 +25,8 @@ from .waiting import Waiting
 class Books:
     """driver, imu: names of the source that drives the keyframes, and of the IMU; of the latter empty where there is none.
 
-    origin: of east, north, up: latitude, longitude, altitude; None before the first fix. landmarks: name -> key.
+    origin: of east, north, up: latitude, longitude, altitude; None before the first fix. landmarks: name -> key. became: key of one that was found
+    to be another -> that of the other.
     newest: the newest keyframe, and its pose by the odometry. stretch: what the IMU measured up to the keyframe that is being made.
     decisions: told with the next update.
     """
@@ -46,6 +47,7 @@ class Books:
         self.fixes, self.earth = Fixes(), earth_from(config)
         self.origin: Sequence[float] | None = config.earth.origin
         self.landmarks: dict[str, int] = {}
+        self.became: dict[int, int] = {}
         self.waiting, self.calibration = Waiting(config), Calibration(config, self.space)
         self.waiting.late = self.calibration.late
         self.applier = Applier(solver, self.space, self.parts, self.waiting.wake)
@@ -62,8 +64,11 @@ class Books:
         return self.applier.estimate
 
     def landmark(self, name: str) -> int:
-        """The key of a landmark by its name; a new name gets a new key."""
-        return self.landmarks.setdefault(name, landmark_key(len(self.landmarks)))
+        """The key of a landmark by its name, that of another if it has been found to be one with it; a new name gets a new key."""
+        key = self.landmarks.setdefault(name, landmark_key(len(self.landmarks)))
+        while key in self.became:
+            key = self.became[key]
+        return key
 
     def tag(self, name: str) -> int:
         """The same of one that is seen with its orientation."""

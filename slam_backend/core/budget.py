@@ -93,7 +93,8 @@ class Budget:
 
     def _held(self, key: int) -> list[Factor]:
         """The sightings of a landmark that are in the graph, in the order of their stamps."""
-        ids = self._ids[key] = [id_ for id_ in self._ids[key] if id_ in self._factors]
+        ids = [id_ for id_ in self._ids[key] if id_ in self._factors and self._factors[id_].keys[1] == key]
+        self._ids[key] = ids
         return sorted((self._factors[id_] for id_ in ids), key=lambda factor: factor.stamp)
 
     # -- from one keyframe -----------------------------------------------------------------------

@@ -19,6 +19,7 @@ from .errors import SlamError, SolverFailure
 from .floor import priors
 from .graph import Decision, Delta, Keyframe, Offer, Pose
 from .jury import Jury
+from .merging import Merger
 from .quarantine import Quarantine
 from .reunion import reunion
 from .robust import ROBUST, Doubt, Robust
@@ -65,7 +66,14 @@ class Change:
         self.paths = Paths(books.space, config.gate.odometry_scale, solver.factors)
         self._quarantine = quarantine
         self._budget = Budget(config, books.space, solver.factors, lambda: self.editor.wishes.ids)
-        stages = _stages(config, self.paths, quarantine, self._budget) if robust is None else robust
+        self._merger = Merger(
+            books,
+            sensing.associators,
+            self.paths,
+            lambda: self.editor.edited_variables | quarantine.suspected,
+        )
+        usual = _stages(config, self.paths, quarantine, self._merger, self._budget)
+        stages = usual if robust is None else robust
         self._is_judged = bool(stages)
         books.applier.booked = self._book
         keyframes = books.timeline.keyframes
@@ -103,6 +111,8 @@ class Change:
             self.paths.book(delta)
             self._quarantine.book(delta)
             self._budget.book(delta)
+            self._merger.book(delta)
+            self._books.decisions += self._merger.take_decisions()
         if delta.remove:
             for key in self._quarantine.left(self._books.estimate.knows):
                 self._books.parts.drop(key)
@@ -211,7 +221,9 @@ class Change:
         return {**self.editor.plan(action, arguments).told, "revision": self._books.revision}
 
 
-def _stages(config: Config, paths: Paths, quarantine: Quarantine, budget: Budget) -> list[Robust]:
+def _stages(
+    config: Config, paths: Paths, quarantine: Quarantine, merger: Merger, budget: Budget
+) -> list[Robust]:
     """What judges factors: loops as the configuration says, fixes on the earth and landmarks always."""
     landmarks = any(isinstance(source, LandmarkSource) for source in config.sources.values())
     fixes = any(isinstance(source, GnssSource) for source in config.sources.values())
@@ -219,5 +231,10 @@ def _stages(config: Config, paths: Paths, quarantine: Quarantine, budget: Budget
         *(ROBUST[name](config, paths) for name in config.robust),
         *([Doubt(config, paths)] if fixes else []),
         *([quarantine] if landmarks else []),
+        *(
+            [merger]
+            if any(isinstance(s, LandmarkSource) and s.merge for s in config.sources.values())
+            else []
+        ),
         *([budget] if landmarks and config.budget.sightings else []),
     ]

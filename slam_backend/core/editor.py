@@ -83,6 +83,11 @@ class Editor:
         return self._history.now
 
     @property
+    def edited_variables(self) -> set[int]:
+        """Of the factors about which a person has decided something."""
+        return {key for id_ in self.wishes.ids for key in self._known[id_].keys}
+
+    @property
     def left_out(self) -> list[Factor]:
         return [factor for id_, factor in self._known.items() if id_ not in self._solver.factors]
 
@@ -162,9 +167,10 @@ class Editor:
         """
         wishes, held = self._history.now, self._solver.factors
         self._known.update((factor.id, factor) for factor in delta.add)  # as a stage may have made it anew
-        self._wanted |= {factor.id: True for factor in delta.add} | dict.fromkeys(delta.remove, False)
-        overruled = {f.id: f for f in delta.add if f.id in wishes.out or f.id in held}
+        self._wanted |= dict.fromkeys(delta.remove, False) | {factor.id: True for factor in delta.add}
         stays = [id_ for id_ in delta.remove if id_ in wishes.forced or id_ not in held]
+        left = held.keys() - (set(delta.remove) - set(stays))
+        overruled = {f.id: f for f in delta.add if f.id in wishes.out or f.id in left}
         decisions: list[Decision] = []
         for id_ in (*overruled, *(id_ for id_ in stays if id_ in self._known)):
             told = self._decision(self._known[id_], "edited")

@@ -1,7 +1,7 @@
 """The vocabulary between sensors, robust stages and solvers: keyframes, factors, deltas, decisions."""
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal, NamedTuple, Protocol
 
 import gtsam
@@ -75,6 +75,12 @@ class Factor:
     @property
     def source(self) -> str:
         return self.id.partition("/")[0]
+
+
+def rekeyed(factor: Factor, old: int, new: int) -> Factor:
+    """The same measurement, of another variable."""
+    keys = tuple(new if key == old else key for key in factor.keys)
+    return replace(factor, factor=factor.factor.rekey(list(keys)), keys=keys)
 
 
 UNTIL_JOINED = 0  # no variable has this key

@@ -7,7 +7,7 @@ done), at two, one after the other (it was moved), at two in turn (there are two
 """
 
 from collections import defaultdict, deque
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
@@ -16,7 +16,7 @@ import numpy as np
 
 from .config import Config
 from .graph import Decision, Delta, Estimate, Factor, Offer
-from .measurement import Array
+from .places import TAGS, Places, apart_by, halves, parted_in_time, place_of, sigma_of, spread
 from .robust.chi2 import chi2_quantile
 from .robust.kernels import without_kernel
 from .robust.stage import Judged
@@ -28,7 +28,6 @@ Reason = Literal["moved", "duplicate", "moving"]
 REMEMBERED = 30  # sightings of a landmark that are looked at
 USUAL = 300  # residuals, of all landmarks, that say what is usual
 TIGHT = 4.0  # standard deviations of a sighting within which nine of ten sightings of one place lie
-TAGS = (gtsam.BetweenFactorPose2, gtsam.BetweenFactorPose3)
 
 
 @dataclass(slots=True, eq=False)
@@ -37,15 +36,6 @@ class History:
 
     ids: deque[str] = field(default_factory=lambda: deque(maxlen=REMEMBERED))
     strange: deque[bool] = field(default_factory=lambda: deque(maxlen=REMEMBERED))
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Places:
-    """Where the sightings of one landmark put it, in the order of their stamps; sigma (m): of a single one."""
-
-    factors: Sequence[Factor]
-    points: Array
-    sigma: float
 
 
 class Quarantine:
@@ -114,6 +104,11 @@ class Quarantine:
             ]  # fmt: skip
         return Delta(remove=tuple(remove)), tuple(decisions)
 
+    @property
+    def suspected(self) -> set[int]:
+        """Landmarks that are in quarantine."""
+        return set(self._out)
+
     def left(self, known: Callable[[int], bool]) -> list[int]:
         """Those that have left the graph with their last sighting, each told once. known: whether the solver still has one."""
         gone = [key for key in self._leaving if not known(key)]
@@ -176,40 +171,23 @@ class Quarantine:
         factors.sort(key=lambda factor: factor.stamp)
         places = self._places(factors, estimate)
         limit = TIGHT * places.sigma
-        if _spread(places.points) <= limit:
+        if spread(places.points) <= limit:
             history.strange.clear()  # one place after all: the noise is larger than it says
             return None
         every = [f for f in self._factors.values() if f.kind == "landmark" and f.keys[1] == key]
-        then = _parted_in_time(places.points)
-        if then is not None and (apart := _apart(places.points[:then], places.points[then:], limit)):
+        then = parted_in_time(places.points)
+        if then is not None and (apart := apart_by(places.points[:then], places.points[then:], limit)):
             since = places.factors[then].stamp
             return "moved", [f for f in every if f.stamp >= since], apart, limit
-        one = _halves(places.points)
-        if apart := _apart(places.points[one], places.points[~one], limit):
+        one = halves(places.points)
+        if apart := apart_by(places.points[one], places.points[~one], limit):
             return "duplicate", every, apart, limit
-        return "moving", every, _spread(places.points), limit
+        return "moving", every, spread(places.points), limit
 
     def _places(self, factors: Sequence[Factor], estimate: Estimate) -> Places:
-        points = np.array([self._place(factor, estimate) for factor in factors])
-        sigmas = [self._sigma(factor) for factor in factors]
+        points = np.array([place_of(factor, estimate) for factor in factors])
+        sigmas = [sigma_of(factor, self._space) for factor in factors]
         return Places(factors, points, float(np.median(sigmas) * np.sqrt(self._excess())))
-
-    def _place(self, factor: Factor, estimate: Estimate) -> Array:
-        seen = factor.factor.measured()
-        if isinstance(factor.factor, TAGS):
-            return np.asarray(estimate.pose(factor.keys[0]).transformFrom(seen.translation()))
-        direction = seen.bearing()
-        ahead = (
-            direction.point3() if hasattr(direction, "point3") else np.array([direction.c(), direction.s()])
-        )
-        return np.asarray(estimate.pose(factor.keys[0]).transformFrom(ahead * seen.range()))
-
-    def _sigma(self, factor: Factor) -> float:
-        """Of the position that a sighting states: its bearing acts across, at its range."""
-        sigmas = np.sqrt(np.diag(without_kernel(factor.factor.noiseModel()).covariance()))
-        if isinstance(factor.factor, TAGS):
-            return float(sigmas[self._space.translation].max())
-        return float(np.hypot(sigmas[-1], sigmas[:-1].max() * factor.factor.measured().range()))
 
 
 WHY: Mapping[Reason, str] = {
@@ -217,40 +195,3 @@ WHY: Mapping[Reason, str] = {
     "duplicate": "there are two of that name, seen in turn: all their sightings are taken out, and further ones refused",
     "moving": "it does not stand still: all its sightings are taken out, and further ones refused",
 }
-
-
-def _spread(points: Array) -> float:
-    """The distance from the median within which nine of ten lie: a few strays are noise, a second place is not."""
-    return float(np.quantile(np.linalg.norm(points - np.median(points, axis=0), axis=1), 0.9))
-
-
-def _apart(one: Array, other: Array, limit: float) -> float:
-    """How far apart two places are; 0 if they are none: wider than the limit, or than a fourth of the way between them."""
-    if not len(one) or not len(other):
-        return 0.0
-    apart = float(np.linalg.norm(np.median(one, axis=0) - np.median(other, axis=0)))
-    return apart if max(_spread(one), _spread(other)) <= min(limit, apart / 4) else 0.0
-
-
-def _parted_in_time(points: Array) -> int | None:
-    """Where a sequence is best cut into two, each around its own place; None if it is too short for that."""
-    cuts: Iterable[int] = range(2, len(points) - 1)
-    scatter = {cut: _scatter(points[:cut]) + _scatter(points[cut:]) for cut in cuts}
-    return min(scatter, key=lambda cut: (scatter[cut], cut), default=None)
-
-
-def _scatter(points: Array) -> float:
-    return float(np.linalg.norm(points - np.median(points, axis=0), axis=1).sum())
-
-
-def _halves(points: Array) -> np.ndarray:
-    """(N,) which of two clusters: k-means (Lloyd, 1982) from the two points that lie farthest apart."""
-    gaps = np.linalg.norm(points[:, None] - points[None], axis=2)
-    a, b = np.unravel_index(int(np.argmax(gaps)), gaps.shape)
-    centres = points[[a, b]]
-    for _ in range(10):
-        first = np.linalg.norm(points - centres[0], axis=1) <= np.linalg.norm(points - centres[1], axis=1)
-        if first.all() or not first.any():
-            break
-        centres = np.array([points[first].mean(axis=0), points[~first].mean(axis=0)])
-    return np.asarray(first)

@@ -26,7 +26,7 @@ class Sensing:
         self._coasts = coasts(books.config)
         self._cameras: dict[str, CameraModel] = {}
         self._memory: dict[str, Any] = {}  # of sensors, by source
-        self._associators = {
+        self.associators = {
             name: Associator(name, source, books.space)
             for name, source in books.config.sources.items()
             if isinstance(source, LandmarkSource)
@@ -34,7 +34,7 @@ class Sensing:
 
     def restore(self, landmarks: Mapping[str, int]) -> None:
         """Those of a saved map, by name."""
-        for associator in self._associators.values():
+        for associator in self.associators.values():
             associator.restore(landmarks)
 
     def see(self, camera: CameraModel) -> None:
@@ -87,7 +87,7 @@ class Sensing:
         for name, source in books.config.sources.items():
             if name in by_source:
                 context, offers = books.calibration.context(self.context(guesses), name), by_source[name]
-                if associator := self._associators.get(name):
+                if associator := self.associators.get(name):
                     offers, decisions = associator.named(offers, a, b, context)
                     offers, refused = self._quarantine.let_in(offers, books.landmarks)
                     books.decisions += decisions + refused

@@ -100,6 +100,7 @@ class Associator:
         self._source, self._config, self._space = source, config, space
         self._names: list[str] = []
         self._keys: list[int] = []
+        self._by_key: dict[int, str] = {}
         self._points = np.zeros((0, space.point_dimension))
         self._age = 0
         self._made = 0
@@ -109,9 +110,14 @@ class Associator:
         """Go on with those of a saved map. landmarks: name -> key."""
         self._names = [name for name in landmarks if self._is_own(name)]
         self._keys = [landmarks[name] for name in self._names]
+        self._by_key = dict(zip(self._keys, self._names, strict=True))
         self._made = max((int(name.rpartition(":")[2]) + 1 for name in self._names), default=0)
         self._points = np.full((len(self._keys), self._space.point_dimension), np.inf)
         self._age = REFRESHED
+
+    def name_of(self, key: int) -> str | None:
+        """Of a landmark that it has named; None of any other."""
+        return self._by_key.get(key)
 
     def named(
         self, offers: Sequence[Offer], a: Keyframe | None, b: Keyframe, context: Context
@@ -316,7 +322,8 @@ class Associator:
         name = f"{self._source}:{self._made}"
         self._made += 1
         self._names.append(name)
-        self._keys.append(context.landmark(name))
+        self._keys.append(key := context.landmark(name))
+        self._by_key[key] = name
         self._points = np.vstack([self._points, np.full(self._space.point_dimension, np.inf)])
         self._age = REFRESHED
         return name

@@ -145,6 +145,12 @@ class LandmarkSource(Mounted):
         description="m around a sighting in which its landmark is looked for, and by which a consensus of sightings may correct the "
         "pose where fewer than half find their landmark",
     )
+    merge: int = Field(
+        5,
+        ge=0,
+        le=100_000,
+        description="scans that must have shown each of two landmarks without ids before they can be found to be one; 0: they never are",
+    )
     calibrate: tuple[Literal["range_scale", "time_offset", "mount", "translation", "rotation"], ...] = Field(  # type: ignore[assignment]  # one more
         (),
         description="constants that are estimated with the map. range_scale; time_offset; translation, rotation, mount (both) of "

@@ -141,12 +141,13 @@ class Isam2:
         return {key for factor in gone if factor.kind != "pixel" for key in factor.keys}
 
     def _commit(self, delta: Delta) -> None:
+        released = {key for id_ in delta.remove for key in self.factors[id_].keys}
         for id_ in _gone(delta):
             self._slots.pop(id_, None)
-            gone = self.factors.pop(id_, None)
-            for key in gone.keys if gone else ():
-                if not self._isam.valueExists(key):
-                    self._guesses.pop(key, None)
+            self.factors.pop(id_, None)
+        for key in released:
+            if not self._isam.valueExists(key):
+                self._guesses.pop(key, None)
         for factor in delta.add:
             self.factors[factor.id] = factor
         self._guesses.update(delta.values)

@@ -19,6 +19,8 @@ SIGMA_TRANSLATION, SIGMA_ROTATION = 0.05, 0.02  # m, rad after 1 m
 SIGMA_POSITION, SIGMA_BEARING, SIGMA_RANGE = 0.1, 0.02, 0.15
 LANDMARKS = np.array([[4.0, 3.0, 1.0], [2.0, -4.0, -1.0], [7.0, 2.0, 0.5], [9.0, -3.0, 1.5]])
 FORMS = [(space, form) for space in ("2d", "3d") for form in ("position", "bearing_range", "pose")]
+PLACELESS = [(space, form) for space in ("2d", "3d") for form in ("bearing", "range")]
+LONG = 24  # steps after which they are placed
 
 
 def sighting(
@@ -31,7 +33,9 @@ def sighting(
         x, y, z = point
         value = np.array([atan2(y, x), atan2(z, hypot(x, y)), np.linalg.norm(point)])
         sigmas = np.array([SIGMA_BEARING, SIGMA_BEARING, SIGMA_RANGE])
-    noisy = value + sigmas * rng.normal(size=3)
+    if form in ("bearing", "range"):
+        value, sigmas = (value[:2], sigmas[:2]) if form == "bearing" else (value[2:], sigmas[2:])
+    noisy = value + sigmas * rng.normal(size=len(value))
     return LandmarkObservation(stamp, "trees", "", name, form, frozen(noisy), frozen(np.diag(sigmas**2)))
 
 
@@ -45,7 +49,7 @@ def sighting_of_tag(
     return LandmarkObservation(stamp, "trees", "", name, "pose", value, frozen(stated))
 
 
-def nees(space_name: str, form: str, seed: int) -> float:
+def nees(space_name: str, form: str, seed: int, steps: int = STEPS) -> float:
     """Squared Mahalanobis distance of the last pose and the first landmark together."""
     rng, space = np.random.default_rng(seed), SPACES[space_name]
     wheels = {
@@ -63,7 +67,7 @@ def nees(space_name: str, form: str, seed: int) -> float:
     twist = np.array([1.0, 0, 0.1]) if space_name == "2d" else np.array([0.03, -0.02, 0.1, 1.0, 0, 0])
     variances = space.diagonal(SIGMA_ROTATION**2, SIGMA_TRANSLATION**2)
     truth = told = space.identity
-    for k in range(STEPS):
+    for k in range(steps):
         stamp = (k + 1) * SECOND
         if k:
             step = space.expmap(twist)
