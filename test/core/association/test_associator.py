@@ -46,7 +46,7 @@ def run(backend: Backend, drive: Simulation, nameless: bool = True, clutter: int
 
 def identities(engine: Backend, drive: Simulation) -> dict[str, Counter]:
     """Name that was given -> which true landmarks its sightings are of, told by their ids."""
-    names = {key: name for name, key in engine._landmarks.items()}
+    names = {engine.landmark(name): name for name in engine.snapshot().names}
     found: dict[str, Counter] = defaultdict(Counter)
     order: dict[str, list] = defaultdict(list)
     for m in drive.measurements:
