@@ -1,6 +1,5 @@
 """`slam-backend run`: the ROS 2 node, on a ROS install or with the wheels of the extra `ros`."""
 
-import signal
 import sys
 from pathlib import Path
 from typing import Annotated
@@ -29,13 +28,12 @@ def command(
     from ..core.config import Config
     from ..core.errors import MissingExtra
     from ..io.configfile import configured, load_config
+    from ..ros.signals import wishes
 
     chosen = configured(load_config(config) if config else Config(), settings or ())
     if data_dir:
         chosen = chosen.model_copy(update={"data_dir": data_dir})
-    signal.pthread_sigmask(
-        signal.SIG_BLOCK, {signal.SIGINT, signal.SIGTERM}
-    )  # until the node is there to hear them
+    heard = wishes()
     try:
         from ..ros.process import main
     except ImportError as error:
@@ -44,6 +42,6 @@ def command(
         ) from None
     given = [each for each in ros_arguments or [] if each != "--ros-args"]
     remap = ["-r", f"__ns:=/{namespace.strip('/')}"] if namespace else []
-    code = main(["--ros-args", *remap, *given], chosen)
+    code = main(["--ros-args", *remap, *given], chosen, heard)
     sys.stdout.flush()
     raise typer.Exit(code)

@@ -2,7 +2,6 @@
 
 import gc
 import os
-import signal
 import sys
 from collections.abc import Sequence
 
@@ -13,6 +12,7 @@ from rclpy.signals import SignalHandlerOptions
 
 from ..core.config import Config
 from .node import STEADY, BackendNode
+from .signals import wishes
 
 BEAT = 0.1  # s within which a signal is heard
 TRANSPORTS, OVER_UDP = (
@@ -21,16 +21,15 @@ TRANSPORTS, OVER_UDP = (
 )  # through shared memory, each process that appears would stop all publishers for 0.3 s (Fast DDS issue 6535)
 
 
-def main(arguments: list[str] | None = None, config: Config | None = None) -> int:
+def main(
+    arguments: list[str] | None = None, config: Config | None = None, heard: Sequence[int] | None = None
+) -> int:
     """Run the node until it is told to stop; exit code 2 with one line for a wrong configuration.
 
-    config: what the parameters start from; ROS arguments override it.
+    config: what the parameters start from; ROS arguments override it. heard: the wishes to end, where they are noted already.
     """
     os.environ.setdefault(TRANSPORTS, OVER_UDP)
-    wishes: list[int] = []
-    for wish in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(wish, lambda number, _: wishes.append(number))  # more than one changes nothing
-    signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT, signal.SIGTERM})
+    heard = wishes() if heard is None else heard
     try:
         rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
         node = BackendNode(start=config)
@@ -39,14 +38,14 @@ def main(arguments: list[str] | None = None, config: Config | None = None) -> in
         rclpy.try_shutdown()
         return 2
     try:
-        return _run(node, wishes)
+        return _run(node, heard)
     finally:
         node.close()
         node.destroy_node()
         rclpy.try_shutdown()
 
 
-def _run(node: BackendNode, wishes: Sequence[int]) -> int:
+def _run(node: BackendNode, heard: Sequence[int]) -> int:
     executor = SingleThreadedExecutor()
     executor.add_node(node)
     node.create_timer(BEAT, lambda: None, clock=STEADY)  # Python hears a signal between two callbacks only
@@ -56,10 +55,6 @@ def _run(node: BackendNode, wishes: Sequence[int]) -> int:
         node.trigger_activate()
     gc.collect()
     gc.freeze()  # modules and message types: to look through them again and again would stop all threads for 50 ms each time
-    while not wishes and rclpy.ok():
+    while not heard and rclpy.ok():
         executor.spin_once()
     return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())
