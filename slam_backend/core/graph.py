@@ -58,7 +58,7 @@ class Factor:
     """A GTSAM factor and where it came from; the id is the same in every replay.
 
     id: `<source>/<stamp>/<n>`, n counting the measurements of that source with that stamp.
-    kind: motion (it made a keyframe), odometry (beside that), loop, landmark, pose, imu, floor, gnss, earth, datum or gauge; what
+    kind: motion (it made a keyframe), odometry (beside that), loop, landmark, range (between two poses), pose, imu, floor, gnss, earth, datum or gauge; what
     reports, robust stages and exports sort by.
     stamp: of the measurement; stamps: of its two ends, for relative measurements.
     motion: between its first pose and its last, where the factor itself has more variables than these.

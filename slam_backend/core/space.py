@@ -104,6 +104,10 @@ class Space(Protocol):
         """Distance of a point from a sensor that sits at `pose_T_sensor`."""
         ...
 
+    def distance(self, pose: int, other: int, value: float, noise: Any) -> gtsam.NonlinearFactor:
+        """Between the origins of two poses."""
+        ...
+
     def estimate(self, solver: Any, key: int) -> Pose: ...
 
     def estimate_point(self, solver: Any, key: int) -> Array: ...
@@ -203,6 +207,9 @@ class Planar:
         if sensor is self.identity:
             return gtsam.RangeFactor2D(pose, point, value, noise)
         return gtsam.RangeFactorWithTransform2D(pose, point, value, noise, sensor)
+
+    def distance(self, pose: int, other: int, value: float, noise: Any) -> gtsam.NonlinearFactor:
+        return gtsam.RangeFactorPose2(pose, other, value, noise)
 
     def to_polar(self, value: Array, covariance: Array) -> tuple[Array, Array]:
         x, y = float(value[0]), float(value[1])
@@ -330,6 +337,9 @@ class Spatial:
         if sensor is self.identity:
             return gtsam.RangeFactor3D(pose, point, value, noise)
         return gtsam.RangeFactorWithTransform3D(pose, point, value, noise, sensor)
+
+    def distance(self, pose: int, other: int, value: float, noise: Any) -> gtsam.NonlinearFactor:
+        return gtsam.RangeFactorPose3(pose, other, value, noise)
 
     def to_polar(self, value: Array, covariance: Array) -> tuple[Array, Array]:
         """The covariance of the bearing is in the basis of the Unit3 that `observe` makes."""

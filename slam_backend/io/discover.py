@@ -73,7 +73,7 @@ def name_of(topic: str) -> str:
 
 def _of_graph(inputs: GraphInput) -> Config:
     sources: dict[str, Any] = {EDGES: {"kind": "relative"}}
-    if len(inputs.graph.sightings):
+    if inputs.graph.sees_landmarks:
         sources[LANDMARKS] = {"kind": "landmark"}
     return config_from({"space": inputs.graph.space, "sources": list(sources), **sources})
 

@@ -158,7 +158,9 @@ class GraphInput(_Closing):
         self.graph: PoseGraph = read_graph(path)
         if not len(self.graph.edges):
             raise BadFile(f"{path}: holds no edges between poses: nothing to optimize")
-        self.count = len(self.graph.edges) + len(self.graph.sightings)
+        self.count = (
+            len(self.graph.edges) + len(self.graph.sightings) + int(self.graph.ranges.to_landmark.sum())
+        )
         self.read = 0
 
     def vertex(self, stamp: int) -> int | None:
@@ -167,7 +169,9 @@ class GraphInput(_Closing):
 
     @property
     def damage(self) -> list[str]:
-        return [f"{self.paths[0]}: {note}" for note in self.graph.notes]
+        between = len(self.graph.ranges) - int(self.graph.ranges.to_landmark.sum())
+        left = [f"{between} ranges between vertices are left out; `solve` takes them"] if between else []
+        return [f"{self.paths[0]}: {note}" for note in (*self.graph.notes, *left)]
 
     def stream(self, config: Config) -> Stream:
         edges = next((name for name, s in config.sources.items() if s.kind == "relative"), None)
@@ -176,7 +180,7 @@ class GraphInput(_Closing):
                 f"{self.paths[0]} is a pose graph: configure a source of kind relative and none of kind odometry"
             )
         sightings = next((name for name, s in config.sources.items() if s.kind == "landmark"), LANDMARKS)
-        if len(self.graph.sightings) and sightings not in config.sources:
+        if self.graph.sees_landmarks and sightings not in config.sources:
             raise BadConfig(f"{self.paths[0]} holds landmarks: configure a source of kind landmark")
         for measurement in measurements(self.graph, edges, sightings):
             self.read += 1

@@ -7,6 +7,7 @@ import gtsam
 from ..core.backend import Backend
 from ..core.config import KernelName
 from ..core.graph import Decision, keyframe, landmark_key
+from ..core.solvers.initialize import add_landmarks
 from .formats.posegraph import name_of
 from .problem import Problem, config_of, odometry_edges, stream
 from .replay import settled_stream
@@ -40,4 +41,5 @@ def _renamed(problem: Problem, backend: Backend) -> gtsam.Values:
     for rank, identifier in enumerate(problem.graph.landmarks.tolist()):
         if found.exists(key := backend.landmark(name_of(identifier))):
             values.insert(landmark_key(rank), problem.space.point_in(found, key))
+    add_landmarks(values, problem.factors, problem.space)  # whose ranges did not place them by the end
     return values

@@ -39,7 +39,8 @@ LOOPS = "loops"  # the source of edges that are not odometry, apart because a ro
 
 @dataclass(frozen=True, eq=False)
 class Problem:
-    """factors: `motion` between consecutive vertices, `loop`, `landmark`, `pose` (priors) and `gauge` (vertices held).
+    """factors: `motion` between consecutive vertices, `loop`, `landmark`, `range` (between vertices), `pose` (priors) and `gauge`
+    (vertices held).
 
     stated: vertices and landmarks where the file states them. decisions: what the firewall or a sensor refused, and why.
     left_out: what no solver here takes, in words.
@@ -94,18 +95,18 @@ def problem_of(graph: PoseGraph, kernel: KernelName = "none") -> Problem:
     for name, window in windows.items():
         source = config.sources[name]
         delta += SENSORS[source.kind].factors(window, None, keyframe(0, 0), context, source)
-    ranges, beacons = len(graph.ranges), len(graph.landmark_priors)
-    left = [f"{n} {what}" for n, what in ((ranges, "ranges"), (beacons, "priors of landmarks")) if n]
+    beacons = len(graph.landmark_priors)
+    left = (f"{beacons} priors of landmarks",) if beacons else ()
+    beside = (*_ranges(graph, space), *_priors(graph, space), *_held(graph, space))
     return Problem(
-        graph, space, (*delta.add, *_priors(graph, space), *_held(graph, space)), _stated(graph, space),
-        (*decisions, *delta.decisions), tuple(left),
-    )  # fmt: skip
+        graph, space, (*delta.add, *beside), _stated(graph, space), (*decisions, *delta.decisions), left
+    )
 
 
 def config_of(graph: PoseGraph, kernel: KernelName = "none") -> Config:
     """The configuration with which `stream(..., apart=True)` can be replayed; a graph file is believed as it is."""
     sources = {EDGES: {"kind": "relative"}, LOOPS: {"kind": "relative", "kernel": kernel}}
-    if len(graph.sightings):
+    if graph.sees_landmarks:
         sources[LANDMARKS] = {"kind": "landmark"}
     return config_from({"space": graph.space, "robust": [], "sources": list(sources), **sources})
 
@@ -152,6 +153,15 @@ def _context(graph: PoseGraph, space: Space) -> Context:
         space, None, {}, Mounts(space, "", {}), placed.get, lambda _, __: still,
         lambda name: landmark_key(ranks[name]), lambda _: 0,
     )  # fmt: skip
+
+
+def _ranges(graph: PoseGraph, space: Space) -> Iterator[Factor]:
+    """Between vertices; those to landmarks come by way of their sensor."""
+    ranges = graph.ranges
+    for n in np.flatnonzero(~ranges.to_landmark).tolist():
+        keys = keyframe(int(ranges.i[n]), 0).pose, keyframe(int(ranges.j[n]), 0).pose
+        noise = gtsam.noiseModel.Isotropic.Variance(1, float(ranges.variances[n]))
+        yield Factor(f"ranges/{n}", "range", space.distance(*keys, float(ranges.ranges[n]), noise), keys, 0)
 
 
 def _priors(graph: PoseGraph, space: Space) -> Iterator[Factor]:

@@ -259,8 +259,10 @@ def _sight(offer: Offer, context: Context, config: LandmarkSource, points: dict[
     if m.form in PLACELESS and not known:
         return Wait(offer, key, f"one {m.form} alone cannot place a landmark")
     if m.form == "range":
-        point = points[key] if key in points else context.point(key)
-        return range_factor(offer, placed, mount, (value, covariance), key, point, context, config)
+        believed = points.get(key)
+        if believed is None and placed.motion is not None:
+            believed = context.point(key)
+        return range_factor(offer, placed, mount, (value, covariance), key, believed, context, config)
     if m.form == "bearing":
         return _bearing(offer, placed, mount, (value, covariance), context, config, points)
     value, noise, point = _polar(m.form, (value, covariance), mount, placed.motion, space)

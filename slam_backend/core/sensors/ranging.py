@@ -14,16 +14,18 @@ PLACELESS = frozenset({"range", "bearing"})  # forms of which one sighting canno
 
 
 def range_factor(
-    offer: Offer, placed: Placed, mount: Pose, seen: tuple[Array, Array], key: int, point: Array,
+    offer: Offer, placed: Placed, mount: Pose, seen: tuple[Array, Array], key: int, point: Array | None,
     context: Context, config: LandmarkSource,
 ) -> Factor:  # fmt: skip
     """The native factor with the sensor where it was, seen from the keyframe; what the motion since then may err along the line
-    of sight is added to the variance. point: where the landmark is believed to be; only the direction of the line counts.
+    of sight is added to the variance. point: where the landmark is believed to be, for the direction of
+    the line; not needed where the sensor was at the keyframe.
     """
     (value, covariance), space, pose_key = seen, context.space, placed.keyframe.pose
     if placed.motion is None:
         sensor, noise = mount, covariance
     else:
+        assert point is not None
         motion = placed.motion
         sensor = motion.pose.compose(mount)
         of_pose = np.zeros((space.point_dimension, space.dimension), order="F")

@@ -6,7 +6,7 @@ the odometry where every edge agrees with them within `WOUND` and `ALONG`. Else 
 edge wound; if they do not, the chordal relaxation takes over.
 """
 
-from collections import deque
+from collections import defaultdict, deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -18,6 +18,8 @@ import numpy as np
 from ..errors import BadConfig, SolverFailure
 from ..graph import HOLDING, Factor, Pose, is_pose
 from ..measurement import Array
+from ..robust.kernels import without_kernel
+from ..sensors.placing import Sighting, place
 from ..space import Space
 from ..variables import is_posed
 from .batch import Start
@@ -207,15 +209,34 @@ def _complete(poses: gtsam.Values, ground: Ground) -> gtsam.Values:
     """With what the file states of vertices that nothing touches, and landmarks where the file or else a sighting says."""
     values = gtsam.Values(ground.stated)
     values.insert_or_assign(poses)
-    for factor in ground.factors:
-        if factor.kind == "landmark" and not values.exists(factor.keys[1]):
-            pose, key = ground.space.pose_in(values, factor.keys[0]), factor.keys[1]
-            tag = pose.compose(factor.factor.measured()) if is_posed(key) else None
-            values.insert(key, pose.transformFrom(_seen(factor)) if tag is None else tag)
+    add_landmarks(values, ground.factors, ground.space)
     for key in ground.keys:
         if not values.exists(key):
             raise SolverFailure(f"nothing says where {gtsam.DefaultKeyFormatter(key)} might be", ())
     return values
+
+
+def add_landmarks(values: gtsam.Values, factors: Sequence[Factor], space: Space) -> None:
+    """Those without a value: where their first sighting says, else where most of their ranges meet."""
+    ranges: dict[int, list[Factor]] = defaultdict(list)
+    for factor in factors:
+        if factor.kind != "landmark" or values.exists(key := factor.keys[1]):
+            continue
+        measured = factor.factor.measured()
+        if isinstance(measured, float):
+            ranges[key].append(factor)
+        else:
+            pose = space.pose_in(values, factor.keys[0])
+            values.insert(key, pose.compose(measured) if is_posed(key) else pose.transformFrom(_seen(factor)))
+    for key, ranging in ranges.items():
+        if not values.exists(key):
+            values.insert(key, place([_distance(each, values, space) for each in ranging]).others[0])
+
+
+def _distance(factor: Factor, values: gtsam.Values, space: Space) -> Sighting:
+    noise = without_kernel(factor.factor.noiseModel())
+    pose, sigma = space.pose_in(values, factor.keys[0]), float(noise.sigmas()[0])
+    return Sighting(pose, factor.keys[0], factor.factor.measured(), sigma, None, 0.0)
 
 
 def _seen(factor: Factor) -> Array:

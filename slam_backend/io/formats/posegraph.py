@@ -117,6 +117,11 @@ class PoseGraph:
         """(N, 7) `map_T_vertex`, or None where the file states no vertices."""
         return None if self.states is None else sevens_of(self.states)
 
+    @property
+    def sees_landmarks(self) -> bool:
+        """Whether a sighting or a range leads to one."""
+        return len(self.sightings) > 0 or bool(self.ranges.to_landmark.any())
+
     def stamps_at(self, period: int = PERIOD) -> Stamps:
         """(N,) ns: the rank of each vertex times `period`, counted from one."""
         return (np.arange(len(self.ids), dtype=np.int64) + 1) * period
@@ -153,13 +158,19 @@ def measurements(
 ) -> "Iterator[Measurement]":
     """The graph as if live: vertex r has the stamp (r + 1) * period, everything comes once both its ends exist.
 
-    Within a stamp the edge whose other end is newest comes first (it is the motion), sightings come after the
-    edges, equals in the order of the file. Ranges and priors are not among them.
+    Within a stamp the edge whose other end is newest comes first (it is the motion), sightings and then ranges of landmarks
+    come after the edges, equals in the order of the file. Ranges between vertices and priors are not among them.
     """
-    edges, sightings = graph.edges, graph.sightings
-    newest = np.concatenate([np.maximum(edges.i, edges.j), sightings.i])
-    other = np.concatenate([np.minimum(edges.i, edges.j), np.full(len(sightings), -1)])
-    records = [*_relatives(graph, source, period), *_observations(graph, landmark_source, period)]
+    edges, sightings, ranging = graph.edges, graph.sightings, graph.ranges.i[graph.ranges.to_landmark]
+    newest = np.concatenate([np.maximum(edges.i, edges.j), sightings.i, ranging])
+    other = np.concatenate(
+        [np.minimum(edges.i, edges.j), np.full(len(sightings), -1), np.full(len(ranging), -2)]
+    )
+    records = [
+        *_relatives(graph, source, period),
+        *_observations(graph, landmark_source, period),
+        *_distances(graph, landmark_source, period),
+    ]
     for n in np.lexsort((-other, newest)).tolist():
         yield records[n]
 
@@ -194,6 +205,20 @@ def _observations(graph: PoseGraph, source: str, period: int) -> "list[LandmarkO
     return [
         LandmarkObservation(stamp, source, "", names[j], "position", values[n], covariances[n])
         for n, (stamp, j) in enumerate(zip(stamps, sightings.j.tolist(), strict=True))
+    ]
+
+
+def _distances(graph: PoseGraph, source: str, period: int) -> "list[LandmarkObservation]":
+    from ...core.sensors.landmark import LandmarkObservation
+
+    ranges, stamps = graph.ranges, graph.stamps_at(period)
+    names = [name_of(identifier) for identifier in graph.landmarks.tolist()]
+    values, variances = frozen(ranges.ranges[:, None]), frozen(ranges.variances[:, None, None])
+    return [
+        LandmarkObservation(
+            int(stamps[ranges.i[n]]), source, "", names[ranges.j[n]], "range", values[n], variances[n]
+        )
+        for n in np.flatnonzero(ranges.to_landmark).tolist()
     ]
 
 
