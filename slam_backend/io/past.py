@@ -11,16 +11,13 @@ from typing import Any
 import numpy as np
 
 from ..core.backend import Update
-from ..core.config import OdometrySource
 from ..core.decisions import as_json
 from ..core.difference import Difference, Jumps, difference
 from ..core.errors import SolverFailure
-from ..core.georeference import Georeference
 from ..core.graph import Decision, keyframe
 from ..core.measurement import Array, format_stamp
 from ..core.query import Unknown
-from ..core.space import Space
-from ..core.trajectory import Snapshot, Stamps, States, Trajectory
+from ..core.shown import Shown
 from .replay import Run
 
 
@@ -61,45 +58,14 @@ class Past:
         return difference(before, run.backend.snapshot(), factors, run.backend.solver.factors, jumps)
 
 
-class Then:
+class Then(Shown):
     """What was believed at a stamp. Implements core.query.Known."""
 
     def __init__(self, past: Past, stamp: int) -> None:
         """Unknown where the run never was."""
         run = past.run_at(stamp)
+        super().__init__(run.backend.snapshot(), run.config)
         self._past, self._stamp = past, stamp
-        self.snapshot: Snapshot = run.backend.snapshot()
-        self.space: Space = run.backend.space
-        driver = run.config.sources.get(run.config.driver or "")
-        self.noise = driver if isinstance(driver, OdometrySource) else OdometrySource()
-
-    @property
-    def trajectory(self) -> Trajectory:
-        return self.snapshot.trajectory
-
-    @property
-    def indices(self) -> Stamps:
-        return self.snapshot.indices
-
-    @property
-    def odometry(self) -> Trajectory:
-        return self.snapshot.odometry
-
-    @property
-    def states(self) -> States:
-        return self.snapshot.states
-
-    @property
-    def earth(self) -> Georeference | None:
-        return self.snapshot.earth
-
-    @property
-    def landmarks(self) -> Mapping[str, Array]:
-        return dict(zip(self.snapshot.names, self.snapshot.landmarks, strict=True))
-
-    @property
-    def orientations(self) -> Mapping[str, Array]:
-        return self.snapshot.orientations
 
     def covariance(self, index: int) -> Array:
         run = self._past.run_at(self._stamp)

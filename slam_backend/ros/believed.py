@@ -1,27 +1,25 @@
 """A living run for core.query: the newest snapshot, the newest decisions, covariances from the worker."""
 
 from collections.abc import Mapping
-from functools import cached_property
 from typing import Any
 
 import numpy as np
 
-from ..core.config import Config, OdometrySource
+from ..core.config import Config
 from ..core.decisions import as_json
 from ..core.errors import SlamError, SolverFailure
-from ..core.georeference import Georeference
 from ..core.graph import Decision
 from ..core.measurement import Array, format_stamp
 from ..core.query import Known, Unknown
-from ..core.space import SPACES
-from ..core.trajectory import Snapshot, Stamps, States, Trajectory
+from ..core.shown import Shown
+from ..core.trajectory import Snapshot
 from ..io.feeder import Feeder
 from ..io.historian import Historian, Question
 
 PATIENCE = 5.0  # s that the worker may take to come to a request
 
 
-class Believed:
+class Believed(Shown):
     """Implements core.query.Known. feeder: waited for when a covariance is asked; None: no covariance is known. historian:
     waited for when something earlier is asked.
     """
@@ -34,39 +32,9 @@ class Believed:
         feeder: Feeder | None = None,
         historian: Historian | None = None,
     ) -> None:
-        self._snapshot, self._decided, self._feeder = snapshot, decided, feeder
+        super().__init__(snapshot, config)
+        self._decided, self._feeder = decided, feeder
         self._config, self._historian = config, historian
-        self.space = SPACES[config.space]
-        driver = config.sources.get(config.driver or "")
-        self.noise = driver if isinstance(driver, OdometrySource) else OdometrySource()
-
-    @property
-    def trajectory(self) -> Trajectory:
-        return self._snapshot.trajectory
-
-    @property
-    def indices(self) -> Stamps:
-        return self._snapshot.indices
-
-    @property
-    def odometry(self) -> Trajectory:
-        return self._snapshot.odometry
-
-    @property
-    def states(self) -> States:
-        return self._snapshot.states
-
-    @property
-    def earth(self) -> Georeference | None:
-        return self._snapshot.earth
-
-    @cached_property
-    def landmarks(self) -> Mapping[str, Array]:
-        return dict(zip(self._snapshot.names, self._snapshot.landmarks, strict=True))
-
-    @property
-    def orientations(self) -> Mapping[str, Array]:
-        return self._snapshot.orientations
 
     def covariance(self, index: int) -> Array:
         """Of a keyframe's pose as the worker believes it now, a little later than the snapshot."""
