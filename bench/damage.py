@@ -61,6 +61,11 @@ def flip(content: dict[str, bytes], rng: np.random.Generator, folder: Path) -> P
     return _laid_out({**content, name: bytes(bent)}, folder)
 
 
+def ends(content: dict[str, bytes], whole: list[Told]) -> np.ndarray:
+    """Where in the database each record ends."""
+    return np.array([content[NAME].find(data) + len(data) for _, _, data in whole])
+
+
 def content_of(folder: Path) -> dict[str, bytes]:
     return {name: (folder / name).read_bytes() for name in (NAME, LOG) if (folder / name).exists()}
 

@@ -68,18 +68,21 @@ def _scan(database: sqlite3.Connection, source: Source, wanted: set[int]) -> Ite
     query = (
         "SELECT m.id, m.topic_id, m.timestamp, "  # noqa: S608  # only question marks are put in
         f"CASE WHEN m.topic_id IN ({','.join('?' * len(wanted))}) THEN m.data END, c.crc32 "
-        "FROM messages m NOT INDEXED LEFT JOIN checksums c ON c.id = m.id WHERE m.id > ? ORDER BY m.id"
+        "FROM messages m NOT INDEXED LEFT JOIN checksums c ON c.id = m.id WHERE m.id "
     )
     end, at, step = _end(database), 0, 1
     whole = False
     while not whole and at <= end:
         try:
-            for row in database.execute(query, (*wanted, at)):
+            for row in database.execute(f"{query} > ? ORDER BY m.id", (*wanted, at)):
                 at, step = row[0], 1
                 yield row
             whole = True
         except UNREADABLE as error:
             source.say(f"the database is damaged: {error}")
+            if step == 1:  # Python has looked ahead, and not told of the row before the damage
+                with suppress(*UNREADABLE):
+                    yield from database.execute(f"{query} = ?", (*wanted, at + 1)).fetchall()
             at, step = at + step, 2 * step
 
 
