@@ -6,14 +6,11 @@ the others out.
 """
 
 import json
-import shutil
 import threading
-from collections.abc import Awaitable, Callable, Iterator, Mapping, Sequence
+from collections.abc import Awaitable, Callable, Mapping, Sequence
 from contextlib import suppress
-from datetime import UTC, datetime
 from functools import partial
 from inspect import isawaitable
-from itertools import count
 from pathlib import Path
 from time import monotonic, sleep
 from typing import Any, TypeVar
@@ -29,7 +26,7 @@ from std_srvs.srv import SetBool, Trigger
 
 from ..core.command import command, text_of
 from ..core.config import Config
-from ..core.errors import BadConfig, BadFile, SlamError
+from ..core.errors import BadConfig, SlamError
 from ..core.graph import Decision
 from ..core.measurement import Array, format_stamp
 from ..core.query import PAST, answers, question
@@ -42,11 +39,9 @@ from .answers import Answers
 from .believed import Believed
 from .editing import edit_in
 from .session import Begin, Session, empty
+from .shelf import Shelf
 from .state import State
 
-RUNS = "runs"  # the folder of saved runs, under data_dir
-ASIDE = "."  # begins the name of a run that is not whole yet
-SAVING = 120.0  # s that the worker may take to come to a request to save, and to do it
 ACTING = 120.0  # s that it may take to come to a command, and to carry it out
 FRESH, FIRST = 0.2, 5.0  # s that an answer may wait for a newer snapshot, and for the first of all
 LOOK = 0.003  # s between two looks for it
@@ -72,12 +67,11 @@ class Services:
         config: Config,
         reset: Callable[[Begin], None],
     ) -> None:
-        self._node, self._state, self._data_dir, self._config = node, state, data_dir, config
+        self._node, self._state, self._config = node, state, config
+        self._shelf = Shelf(data_dir)
         self._session_of, self._refresh, self._reset = session_of, refresh, reset
         self._closed = False
         self._resetting = threading.Lock()
-        for broken in (data_dir / RUNS).glob(f"{ASIDE}*"):  # by a node that ended while it saved
-            shutil.rmtree(broken, ignore_errors=True)
         group = ReentrantCallbackGroup()
         table: dict[str, tuple[Any, Any]] = {
             "query": (GetParameters, self._query),
@@ -195,31 +189,14 @@ class Services:
     # -- what is to be done ----------------------------------------------------------------------
 
     async def _save(self) -> Content:
-        """A run directory: written aside, so that one with its name is whole."""
+        """A run directory under the data directory."""
         feeder = self._feeder_of()
         if feeder is None or self._state.update is None:
             raise SlamError(
                 "there is nothing to save yet: no message of the driving source has been accepted"
             )
         asked = feeder.request
-        return await self._elsewhere(lambda: self._saved(asked))
-
-    def _saved(self, ask: Callable[..., Any]) -> Content:
-        stamp = datetime.now(UTC).strftime("%Y-%m-%dT%H-%M-%SZ")
-        runs = self._data_dir / RUNS
-        try:
-            runs.mkdir(parents=True, exist_ok=True)
-            run = next(run for run in _names(runs / stamp) if not run.exists() and _made(_aside(run)))
-            try:
-                summary = ask("save", str(_aside(run)), SAVING)
-                _aside(run).rename(run)
-            except BaseException:
-                shutil.rmtree(_aside(run), ignore_errors=True)
-                raise
-        except OSError as error:
-            raise BadFile(f"{runs}: the run cannot be saved: {error}") from None
-        counts = {name: summary["counts"][name] for name in ("keyframes", "landmarks", "factors")}
-        return {"run": str(run), "run_hash": summary["run_hash"], **counts}
+        return await self._elsewhere(lambda: self._shelf.save(asked))
 
     async def _command(self, action: str, arguments: Mapping[str, Any]) -> Content:
         """What came of a command that went by way of the journal. SlamError says why it was not carried out."""
@@ -284,7 +261,7 @@ class Services:
     async def _load(self, request: LoadMap.Request, response: LoadMap.Response) -> Any:
         """A new session in the map of a run; what goes wrong is a line of the log, since the type has no room for it."""
         try:
-            run = inside(self._data_dir, request.map_url)
+            run = self._shelf.find(request.map_url)
             saved = await self._elsewhere(lambda: read_map(run))
             if self._config.sources:  # else its space is still to be found
                 fits(saved, self._config.space)
@@ -335,15 +312,6 @@ class Services:
         return outcome[0]
 
 
-def inside(data_dir: Path, url: str) -> Path:
-    """The run that a request names. BadFile for what lies outside the data directory, by whatever way."""
-    root = data_dir.resolve()
-    path = (root / url.removeprefix("file://")).resolve()
-    if not url or root not in path.parents:
-        raise BadFile(f"only a run inside {root} can be loaded")
-    return path
-
-
 def _then(stamp: int) -> str:
     return f"{PAST}{format_stamp(stamp)}/pose@now"
 
@@ -361,26 +329,6 @@ def _told(
         return response
 
     return callback
-
-
-def _names(path: Path) -> Iterator[Path]:
-    """path, path-2, path-3, ..."""
-    yield path
-    yield from (path.with_name(f"{path.name}-{n}") for n in count(2))
-
-
-def _aside(run: Path) -> Path:
-    """Where it is written: a run under its own name is whole."""
-    return run.with_name(f"{ASIDE}{run.name}")
-
-
-def _made(folder: Path) -> bool:
-    """Whether the folder is new: of two that save at once each gets its own."""
-    try:
-        folder.mkdir()
-    except FileExistsError:
-        return False
-    return True
 
 
 def _parameter(value: Value) -> ParameterValue:
