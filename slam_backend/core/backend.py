@@ -13,6 +13,7 @@ from .adopted import Adopted
 from .books import Books
 from .change import Change, Update
 from .command import Command
+from .condition import Condition
 from .config import Config, GnssSource, LandmarkSource, OdometrySource, PoseSource, RelativeSource
 from .consistency import Fit
 from .drive import Drive
@@ -197,6 +198,10 @@ class Backend:
     def recent(self, count: int) -> Fit:
         """The newest factors at the present estimate; what is older than all of them is held where it is."""
         return self._reading.recent(count)
+
+    def conditions(self) -> Mapping[str, Condition]:
+        """How each source does, by name: see core/condition.py."""
+        return self._reading.conditions()
 
     def earth(self) -> Array | None:
         """(7,) `map_T_earth`: where the frame east, north, up at `origin` lies in the map; None before that is known."""

@@ -32,6 +32,16 @@ class Compared:
     antennas: Array
 
 
+@dataclass(frozen=True, slots=True)
+class Tally:
+    """Of one receiver. newest: stamp (ns) of its newest fix; status: of that, as in NavSatStatus."""
+
+    told: int = 0
+    withheld: int = 0
+    newest: int = 0
+    status: int = 0
+
+
 class Fixes:
     """Kept in columns: a receiver tells ten a second, for days."""
 
@@ -40,7 +50,7 @@ class Fixes:
         self._who, self._kinds = array("i"), dict[tuple[str, str], int]()
         self._withheld = array("b")
         self._first: dict[str, int] = {}  # stamp, by source
-        self._counts: dict[str, int] = defaultdict(int)
+        self._tallies: dict[str, Tally] = defaultdict(Tally)
 
     def __len__(self) -> int:
         return len(self._stamps)
@@ -48,17 +58,22 @@ class Fixes:
     def add(self, fix: Fix, config: GnssSource) -> bool:
         """Whether it is to be used: it is not when the configuration keeps it back as a truth."""
         begin = self._first.setdefault(fix.source, fix.stamp)
-        self._counts[fix.source] += 1
+        tally = self._tallies[fix.source]
         since = (fix.stamp - begin) / SECOND
         every = config.withhold_every
         withheld = any(start <= since < end for start, end in config.withhold)
-        withheld |= every is not None and self._counts[fix.source] % every == 0
+        withheld |= every is not None and (tally.told + 1) % every == 0
+        newest, status = max((tally.newest, tally.status), (fix.stamp, fix.status))
+        self._tallies[fix.source] = Tally(tally.told + 1, tally.withheld + withheld, newest, status)
         variances = np.diag(stated(fix, config))
         self._stamps.append(fix.stamp)
         self._numbers.extend((*fix.place.tolist(), (variances[:2].mean()) ** 0.5, variances[2] ** 0.5))
         self._who.append(self._kinds.setdefault((fix.source, fix.frame), len(self._kinds)))
         self._withheld.append(withheld)
         return not withheld
+
+    def tally(self, source: str) -> Tally:
+        return self._tallies.get(source, Tally())
 
     def compared(
         self,

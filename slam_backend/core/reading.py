@@ -1,12 +1,13 @@
 """The back-end as it is read: snapshots, places on the earth, what another session needs. Nothing here changes anything."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import gtsam
 import numpy as np
 from gtsam import symbolIndex
 
 from .books import Books
+from .condition import Condition, conditions
 from .config import GnssSource
 from .consistency import Fit
 from .fixes import Compared
@@ -100,6 +101,10 @@ class Reading:
         why = books.waiting.why(EARTH) or ("no fix has been used" if books.origin else "no fix has come")
         kept = books.solver.factors.__contains__
         return georeference(books.space, books.estimate, books.origin, first, kept, why)
+
+    def conditions(self) -> Mapping[str, Condition]:
+        """How each source does, by name."""
+        return conditions(self._books, self.georeference())
 
     def earth(self) -> Array | None:
         """(7,) `map_T_earth`: where the frame east, north, up at `origin` lies in the map; None before that is known."""

@@ -14,10 +14,12 @@ from contextlib import suppress
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from pathlib import Path
+from time import monotonic
 from typing import Any, Literal
 
 from ..core.backend import Update
 from ..core.command import parse
+from ..core.condition import Condition
 from ..core.config import Config
 from ..core.consistency import blind_axes
 from ..core.errors import SlamError
@@ -33,6 +35,7 @@ from .typestore import typestore_of
 
 RECENT = 1500  # factors at which the noise of the sources is looked at: some 30 ms
 FIRST = 100  # factors, below which it is not
+SHARE = 50  # of the worker's time at most one part in so many goes into looking at how the sources do
 
 RequestName = Literal["snapshot", "covariance", "dry_run", "save", "finish"]
 
@@ -42,6 +45,7 @@ class Report:
     """What changed since the last one. applied: id of the newest row that was read. covariance: of the newest keyframe's pose, 36
     numbers in ROS order; None without updates, or when it is not determined. update_ms: median and p99. reached: the newest stamp (ns)
     that has been applied. consistency: by source, whether its noise is what it says, as summary.json has it; None: as before.
+    conditions: how each source does (core/condition.py); None: as before.
     """
 
     applied: int
@@ -53,6 +57,7 @@ class Report:
     memory_mb: float
     reached: int = 0
     consistency: Mapping[str, Any] | None = None
+    conditions: Mapping[str, Condition] | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -154,6 +159,9 @@ class _Worker:
         self._updates: list[Update] = []
         self._told = 0
         self._judged = 0  # factors, when the noise of the sources was looked at last
+        self._looked = (
+            0.0  # s on the monotonic clock, from when on the condition of the sources is worth a look
+        )
 
     def serve(self) -> None:
         failed = ""
@@ -185,6 +193,7 @@ class _Worker:
             resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
             self._run.reached,
             self._consistency(),
+            self._conditions(),
         )
         self._pipe.send(report)
 
@@ -197,6 +206,15 @@ class _Worker:
         self._judged = factors
         found = backend.recent(RECENT).consistency(blind_axes(self._run.config))
         return {source: each.as_json() for source, each in found.items()}
+
+    def _conditions(self) -> Mapping[str, Condition] | None:
+        """At most once a second, and for at most one part in SHARE of the time."""
+        begin = monotonic()
+        if begin < self._looked or not len(self._run.backend.timeline):
+            return None
+        found = self._run.backend.conditions()
+        self._looked = monotonic() + max(1.0, SHARE * (monotonic() - begin))
+        return found
 
     def _covariance(self, update: Update) -> tuple[float, ...] | None:
         backend = self._run.backend

@@ -63,7 +63,11 @@ class Diagnostics:
             if who == source
         }
         fit = self._state.consistency.get(source, {})
-        values = {"topic": topic, **{rule: str(n) for rule, n in told.items()}}
+        values = {
+            "topic": topic,
+            **self._state.conditions.get(source, {}),
+            **{rule: str(n) for rule, n in told.items()},
+        }
         if "ratio" in fit:
             low, high = fit["bounds_95"]
             values |= {

@@ -7,6 +7,7 @@ from time import monotonic
 from typing import Any
 
 from ..core.backend import Update
+from ..core.condition import Condition
 from ..core.firewall.rules import rule_of
 from ..core.graph import Decision
 from ..core.trajectory import Snapshot
@@ -28,6 +29,7 @@ class State:
         self.covariance: tuple[float, ...] | None = None  # 36, ROS order, of the newest keyframe
         self.snapshot: Snapshot | None = None
         self.consistency: Mapping[str, Any] = {}  # by source, as summary.json has it
+        self.conditions: Mapping[str, Condition] = {}  # by source
         self.decided: dict[str, Decision] = {}
         self.refused: dict[tuple[str, str], int] = {}  # (source, stage/reason) -> count
         self.noted: dict[tuple[str, str], int] = {}  # the same for what the firewall kept, with a remark
@@ -48,6 +50,7 @@ class State:
         with self._lock:
             self.report = report
             self.consistency = self.consistency if report.consistency is None else report.consistency
+            self.conditions = self.conditions if report.conditions is None else report.conditions
             self._note(report.updates)
             if report.updates:
                 self._newest = report.updates[-1], report.covariance
@@ -125,7 +128,7 @@ class State:
             self._revision = 0
             self.revisions.clear()
             self._unshown, self._behind, self._newest = False, 0, None
-            self.consistency = {}
+            self.consistency, self.conditions = {}, {}
 
     def untold_decisions(self) -> list[Decision]:
         """Those that have not been published yet; each is handed out once."""

@@ -29,6 +29,18 @@ DRIVES = {  # scenario, options, topics that are played (all of them: none named
 }  # fmt: skip
 
 
+SAID = {  # of a source on /diagnostics, besides what is said of every source
+    "gps": {"in_graph", "told", "withheld", "status", "since_s", "yaw", "sigma_yaw_rad"},
+    "imu": {"in_graph", "bias_accelerometer", "bias_gyroscope", "sigma_bias_accelerometer", "sigma_bias_gyroscope"},
+}  # fmt: skip
+
+
+def keys_of(told, source):
+    """Of the newest diagnostics of a source."""
+    lines = [status for status in told[-1].status if status.name == f"slam_backend: {source}"] if told else []
+    return {pair.key for status in lines for pair in status.values}
+
+
 @pytest.fixture
 def sensed(tmp_path):
     """`sensed(name)`: records of a simulated drive with those sensors, and the configuration."""
@@ -59,11 +71,14 @@ def test_what_a_sensor_says_live_is_what_replay_computes(backend, peer, sensed, 
     node = backend(config)
     poses = peer.hear("/slam_backend/pose", "geometry_msgs/msg/PoseWithCovarianceStamped")
     moving = peer.hear("/slam_backend/odometry", "nav_msgs/msg/Odometry")
+    told = peer.hear("/diagnostics", "diagnostic_msgs/msg/DiagnosticArray")
     half = len(records) // 2
     peer.play(records[:half], rate=10)
     peer.until(lambda: poses)
     peer.play(records[half:], rate=10)
     peer.until(lambda: moving or name == "fixes alone")
+    for source in {"gps", "imu"} & yaml.safe_load(config.read_text()).keys():
+        peer.until(lambda source=source: keys_of(told, source) >= SAID[source])
     summary = node.end()
     offline = node.replayed()
     assert summary["counts"]["records"] == len(records)
