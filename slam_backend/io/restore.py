@@ -1,6 +1,7 @@
 """What a folder holds of a session that was not ended, and what it takes to go on with it."""
 
 import fcntl
+import json
 import sqlite3
 from collections import Counter
 from collections.abc import Callable, Sequence
@@ -20,6 +21,8 @@ from .schema import connect, insert, open_journal
 from .storage.wal import torn
 
 RUN = "run"  # the folder, beside the journal, of the run that is saved at the end
+RUNS = "runs"  # the folder, beside the journal, of those that are saved on the way
+SUMMARY = "summary.json"
 LOCK = "journal.lock"
 ENDINGS = ("", "-wal", "-shm")
 BESIDE_THE_RESULT = ("data_dir", "autostart", "path", "journal")  # settings that change no trajectory
@@ -139,7 +142,22 @@ def set_aside(folder: Path, names: Sequence[str] = (NAME, RUN)) -> int:
                     old.rename(new)
             except OSError as error:
                 raise BadFile(f"{old}: cannot be set aside: {error.strerror}") from None
+    if RUN in names:
+        _follow(folder, n)
     return n
+
+
+def _follow(folder: Path, n: int) -> None:
+    """The runs of a session, also those saved on the way, say from now on where its journal is: queries and edits replay it."""
+    old, new = (folder / NAME).resolve(), folder / _numbered(NAME, n)
+    for path in (folder / _numbered(RUN, n) / SUMMARY, *folder.glob(f"{RUNS}/*/{SUMMARY}")):
+        with suppress(OSError, ValueError, LookupError, TypeError):  # a run that is damaged stays as it is
+            told = json.loads(path.read_text(encoding="utf-8"))
+            if [Path(name).resolve() for name in told["input"]] == [old]:
+                told["input"] = [str(new.absolute())]
+                fresh = folder / f"{new.name}.json"
+                fresh.write_text(json.dumps(told, indent=1) + "\n", encoding="utf-8")
+                fresh.replace(path)
 
 
 def _numbered(name: str, n: int) -> str:

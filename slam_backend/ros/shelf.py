@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from ..core.errors import BadFile
+from ..io.restore import RUNS
 
-RUNS = "runs"  # the folder of saved runs
 ASIDE = "."  # begins the name of a run that is not whole yet
 SAVING = 120.0  # s that the worker may take to come to a request to save, and to do it
 

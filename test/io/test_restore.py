@@ -1,5 +1,6 @@
 """What is gone on with after a crash, and what is not; a damaged journal gives all that is whole, and says what is not."""
 
+import json
 import shutil
 import sqlite3
 from pathlib import Path
@@ -9,12 +10,17 @@ import pytest
 
 from bench import crash
 from bench.damage import content_of, flip, write
+from bench.laps import config as laps_config
+from bench.laps import laps
 from slam_backend.core.config import Config, OdometrySource, config_to
 from slam_backend.core.errors import BadFile
 from slam_backend.io import events
 from slam_backend.io.bags import open_bag
+from slam_backend.io.finished import FinishedRun
 from slam_backend.io.journal import NAME, Journal
+from slam_backend.io.replay import replay
 from slam_backend.io.restore import RUN, claim, examine, salvage, set_aside, unfinished
+from slam_backend.io.rundir import write_run
 
 GOLDEN = Path(__file__).parent / "golden" / "unsealed.db3"
 CONFIG = Config(space="2d", sources={"wheels": OdometrySource(topic="/odom")})
@@ -132,6 +138,29 @@ def test_what_is_set_aside_takes_the_next_free_number(tmp_path) -> None:
         assert (tmp_path / f"run-{n}").is_dir()
     assert not (tmp_path / NAME).exists()
     assert not (tmp_path / RUN).exists()
+
+
+def test_a_session_that_is_set_aside_can_still_be_asked_and_edited(tmp_path) -> None:
+    """Its run, and one that was saved on the way, know where its journal is now; those of others stay as they are."""
+    journal = Journal(tmp_path, print)
+    for record in laps(140, 5):
+        journal.append(record.topic, record.type, record.data)
+    journal.close(END)
+    result = replay(journal.path, laps_config()).result
+    for name in ("run", "runs/saved", "runs/other"):
+        write_run(result, tmp_path / name)
+    other = tmp_path / "runs" / "other" / "summary.json"
+    other.write_text(json.dumps(result.summary | {"input": ["/elsewhere/journal.db3"]}))
+    before = other.read_bytes()
+    assert set_aside(tmp_path) == 1
+    lived(tmp_path)  # the next session
+    for name in ("run-1", "runs/saved"):
+        finished = FinishedRun(tmp_path / name)
+        assert finished.summary == result.summary | {"input": [str(tmp_path / "journal-1.db3")]}
+        again = finished.again()
+        assert again.result.summary["run_hash"] == result.summary["run_hash"]
+        finished.compare(again)
+    assert other.read_bytes() == before
 
 
 @pytest.mark.slow
