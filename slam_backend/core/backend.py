@@ -31,7 +31,7 @@ from .reading import Reading
 from .robust import Robust
 from .sensing import Sensing
 from .sensors.camera import CameraModel
-from .sensors.gnss import Fix
+from .sensors.gnss import Fix, grounded
 from .sensors.relative import RelativePose
 from .sessions import SavedMap, fits
 from .settle import FAR
@@ -112,9 +112,11 @@ class Backend:
             return self._extend(stamps)
         if self._by_edges and isinstance(measurement, RelativePose) and measurement.source == books.driver:
             books.mounts.name_base(measurement.frame_j)
-        if isinstance(measurement, Fix) and not self._takes(measurement):
-            books.decisions.append(decided(measurement, "refused", "gnss/withheld"))
-            return []
+        if isinstance(measurement, Fix):
+            measurement = grounded(measurement, self.space)
+            if not self._takes(measurement):
+                books.decisions.append(decided(measurement, "refused", "gnss/withheld"))
+                return []
         updates = self.complete(measurement.stamp)
         books.decisions += books.waiting.offer(measurement)
         self._is_complete = False

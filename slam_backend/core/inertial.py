@@ -25,6 +25,7 @@ INTEGRATION = (
 PERIOD = 0.01  # s between samples, before two of them have told
 STILL_RATE, STILL_ACCELERATION = 0.006, 0.06  # rad/s, m/s^2: largest standard deviations of an IMU at rest
 LARGEST_BIAS = 0.1  # rad/s: a mean rate that may still be the bias of an IMU at rest
+STUCK = SECOND  # ns of the very same numbers that no IMU tells by itself: a real one has noise
 STRAIGHT = 1e-3  # relative change of a slope that is only rounding
 ENOUGH = 5  # samples, to tell by their looks whether the robot stands still
 ODD = 0.5  # of gravity: what the first samples may differ from it
@@ -116,6 +117,7 @@ class Inertial:
         self._flaw = ""
         self._bias = Bias()  # last believed
         self._slope, self._straight = 0.0, 0  # of the vertical acceleration, per ns; ns
+        self._same: int | None = 0  # ns for which nothing has changed; None once that has been told
         self._period = PERIOD  # s between the newest two samples
         self._decisions: list[Decision] = []
 
@@ -148,6 +150,12 @@ class Inertial:
         self._slope = float(sample.acceleration[2] - before.acceleration[2]) / elapsed if elapsed > 0 else 0.0
         on = self._slope != 0 and abs(self._slope - last) <= STRAIGHT * abs(self._slope)
         self._straight = self._straight + elapsed if on else 0
+        if self._same is not None:
+            stuck = self._slope == 0 and elapsed > 0 and _are_alike(sample, before)
+            self._same = self._same + elapsed if stuck else 0
+            if self._same > STUCK:
+                self._decide(sample.stamp, "accepted", "imu/stuck", self._same / SECOND)
+                self._same = None
 
     def _collect(self, sample: ImuSample) -> None:
         """Before the first keyframe: the samples of the last seconds, without a gap between them."""
@@ -368,6 +376,11 @@ class Inertial:
         self, stamp: int, verdict: Verdict, rule: str, statistic: float, threshold: float | None = None
     ) -> None:
         self._decisions.append(decided(Measurement(stamp, self._source), verdict, rule, statistic, threshold))
+
+
+def _are_alike(one: ImuSample, other: ImuSample) -> bool:
+    """Whether all six numbers are the same, to the last bit."""
+    return np.array_equal(one.acceleration, other.acceleration) and np.array_equal(one.rate, other.rate)
 
 
 def _variance(covariance: Array) -> float | None:

@@ -194,3 +194,18 @@ def test_the_earth_of_a_second_drive_moves_with_it_when_a_loop_joins_a_map_witho
     assert shape.size(poses[0])[0] < 0.01, "the map stays"
     away = road.errors(second, [*truth, *true])
     assert np.sqrt(np.mean(away[120:] ** 2)) < 0.25
+
+
+@pytest.mark.parametrize("altitude", [np.nan, -np.inf, 1e308])
+def test_in_the_plane_a_receiver_need_not_tell_a_height(road, altitude):
+    """Its place on the ground is as good without; the estimate is the same to a millimetre."""
+    items, _ = road.drive("2d")
+    ends = []
+    for height in (0.0, altitude):
+        found = road.backend("2d")
+        road.run(
+            found,
+            [replace(m, place=frozen((*m.place[:2], height))) if isinstance(m, Fix) else m for m in items],
+        )
+        ends.append(found.snapshot().trajectory.sevens)
+    np.testing.assert_allclose(*ends, atol=1e-3)

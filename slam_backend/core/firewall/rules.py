@@ -124,6 +124,10 @@ RULES: Mapping[str, Rule] = {
         "warn", "for longer than a gap the samples lie on a straight line: somebody filled a gap with them; the stretch is not used",
         "send only what was measured: a gap is better than a guess", unit="s", setting="<imu>.max_gap",
     ),
+    "imu/stuck": Rule(
+        "warn", "for a second the six numbers of the IMU have not changed at all: a real one has noise; they are used, and this is told once",
+        "look for a driver that repeats its last sample; a simulator without noise may do so", 1.0, "s",
+    ),
     "imu/gravity": Rule(
         "error", "at the start the mean acceleration is nothing like gravity",
         "accelerations must be in m/s^2 and include gravity (at rest 9.81 upwards)", unit="m/s^2", setting="<imu>.gravity",

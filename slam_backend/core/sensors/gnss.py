@@ -25,6 +25,7 @@ from ..context import Context, Unusable, each
 from ..graph import DATUM, EARTH, UNTIL_JOINED, Decision, Delta, Factor, Keyframe, Motion, Offer, Pose, Wait
 from ..measurement import Array, Decoder, Measurement, Message, format_stamp, frozen, stamp_of
 from ..robust.kernels import noise_of, with_kernel
+from ..space import Space
 
 UNKNOWN, DIAGONAL = 0, 2  # of position_covariance_type; 1 is approximated, 3 known as a whole
 SEEN = 64  # fixes that the first guess looks at, however many wait
@@ -33,6 +34,7 @@ SURE = 1e-4  # m and rad; of the earth in the map, where it holds the graph
 ROUNDS = 10  # of reweighting
 MISFIT = 3.0  # standard deviations by which the better half of the fixes may lie aside,
 SLIP = 0.2  # and m per m of odometry beside
+HIGHEST = 1e6  # m above the ellipsoid, of any receiver
 JOINED = (
     "the fixes tell where this part of the map lies on the earth, which another part knows: they are one now"
 )
@@ -65,6 +67,13 @@ def decode(message: Message, source: str) -> Fix:
 
 
 DECODERS: Mapping[str, Decoder] = {"sensor_msgs/msg/NavSatFix": decode}
+
+
+def grounded(fix: Fix, space: Space) -> Fix:
+    """As the space uses it: in the plane the height is not looked at, and some receivers tell NaN there, or nonsense."""
+    if space.point_dimension == 3 or abs(fix.place[2]) < HIGHEST:
+        return fix
+    return replace(fix, place=frozen((fix.place[0], fix.place[1], 0.0)))
 
 
 def factors(

@@ -256,6 +256,21 @@ def test_samples_that_somebody_drew_across_a_gap_count_as_a_gap():
     assert all(flight.stamps[0] + 5 * SECOND < each.stamp < flight.stamps[0] + 8 * SECOND for each in found)
 
 
+def test_an_imu_that_repeats_its_last_sample_is_said_once():
+    """For three seconds in the midst of the flight; the samples are used, since a simulator may have no noise."""
+    flight = Flight(1)
+    first, last = 5 * RATE, 8 * RATE
+    stuck = [replace(flight.samples[first], stamp=each.stamp) for each in flight.samples[first : last + 1]]
+    samples = [*flight.samples[:first], *stuck, *flight.samples[last + 1 :]]
+    _, decisions = run(config("wheels"), samples, flight.odometry())
+    (told,) = [each for each in decisions if each.reason == "stuck"]
+    assert told.verdict == "accepted"
+    assert 1.0 < told.statistic < 1.1
+    assert "stuck" not in {
+        each.reason for each in run(config("wheels"), flight.samples, flight.odometry())[1]
+    }
+
+
 def test_while_the_imu_is_silent_odometry_goes_on_and_afterwards_it_begins_anew():
     flight = Flight(2)
     samples = [*flight.samples[: 4 * RATE], *flight.samples[8 * RATE :]]
