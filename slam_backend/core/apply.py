@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
-from functools import cache
 from typing import Any
 
 from .errors import SolverFailure
@@ -203,13 +202,14 @@ class Applier:
             self.sighted.pop(key, None)
 
     def _book(self, delta: Delta) -> None:
-        asked = cache(self._started(delta))  # a camera makes hundreds of points at one pose
+        started: dict[int, Pose] = {}  # a camera makes hundreds of points at one pose
         for factor in delta.add:
-            fresh = [key for key in factor.keys if self._parts.of(key) is None]
-            pose = pose_beside(factor.keys[0])
-            for key in fresh:
+            for key in [key for key in factor.keys if self._parts.of(key) is None]:
+                pose = pose_beside(factor.keys[0])
+                if pose not in started:
+                    started[pose] = self._started(delta, pose)
                 self._parts.put(key, pose)
-                self.sighted[key] = (pose, seen_from(asked(pose), key, delta.values[key]))
+                self.sighted[key] = (pose, seen_from(started[pose], key, delta.values[key]))
                 self._wake(key)
             if factor.kind == "datum" and (part := self._parts.of(factor.keys[0])) is not None:
                 self._parts.release(part)
@@ -217,16 +217,13 @@ class Applier:
                 self.decisions.append(self._verdicts.get(factor.id) or _accepted(factor))
         self.booked(delta)
 
-    def _started(self, delta: Delta) -> Callable[[int], Pose]:
+    def _started(self, delta: Delta, key: int) -> Pose:
         """The first guess of a pose; of one that has been there before, what is believed."""
-        estimate = self.estimate
-        assert estimate is not None
-
-        def pose_of(key: int) -> Pose:
-            guess = delta.values.get(key)
-            return estimate.pose(key) if guess is None else guess
-
-        return pose_of
+        guess = delta.values.get(key)
+        if guess is not None:
+            return guess
+        assert self.estimate is not None
+        return self.estimate.pose(key)
 
 
 def _nobody(delta: Delta) -> None:

@@ -109,7 +109,7 @@ class Backend:
         if isinstance(measurement, Command):
             return self._change.carry_out(measurement)
         if (stamps := self._drive.takes(measurement)) is not None:
-            return self._extend(stamps)
+            return self._extend(stamps) if stamps else []
         if self._by_edges and isinstance(measurement, RelativePose) and measurement.source == books.driver:
             books.mounts.name_base(measurement.frame_j)
         if isinstance(measurement, Fix):

@@ -46,13 +46,14 @@ class Drive:
     def takes(self, measurement: Measurement) -> Iterable[int] | None:
         """The stamps of keyframes to make. None: it does not flow, and lands at a keyframe."""
         books = self._books
+        if isinstance(measurement, ImuSample):  # the most frequent first
+            mine = self._inertial if measurement.source == books.imu else None
+            return self._sample(measurement, mine) if mine else None
         if isinstance(measurement, OdometryPose) and measurement.source == books.driver:
             return self._odometry(measurement)
         if isinstance(measurement, OdometryPose) and measurement.source in self._beside:
             books.decisions += self._beside[measurement.source].add(measurement, bool(books.newest))
             return ()
-        if isinstance(measurement, ImuSample) and self._inertial and measurement.source == books.imu:
-            return self._sample(measurement, self._inertial)
         return None
 
     def _odometry(self, odometry: OdometryPose) -> Iterator[int]:
@@ -96,7 +97,12 @@ class Drive:
             books.decisions.append(refusal(Offer(identify(sample, 0), sample), "imu", why.reason, why.detail))
             return ()
         inertial.add(sample, None if mount is books.space.identity else mount)
-        return self._propagated(sample, inertial) if self._by_imu else ()
+        moves = self._by_imu and (
+            books.newest is None
+            or sample.stamp - books.track.newest >= STEP
+            or books.waiting.wants(sample.stamp)
+        )
+        return self._propagated(sample, inertial) if moves else ()
 
     def _propagated(self, sample: ImuSample, inertial: Inertial) -> Iterator[int]:
         books = self._books

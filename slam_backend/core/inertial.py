@@ -6,7 +6,7 @@ of the biases.
 """
 
 from dataclasses import dataclass
-from math import atan2, hypot
+from math import atan2, hypot, inf
 
 import gtsam
 import numpy as np
@@ -102,6 +102,10 @@ class Inertial:
 
     def __init__(self, source: str, config: ImuSource) -> None:
         self._source, self._config = source, config
+        self._longest = config.max_gap * SECOND  # ns
+        self._ends = (
+            config.max_rate is not None or config.max_acceleration is not None
+        )  # it says where its range does
         self._samples: list[
             ImuSample
         ] = []  # since the newest keyframe; before the first, of the last seconds
@@ -145,9 +149,10 @@ class Inertial:
         filled a gap with them.
         """
         elapsed, last = sample.stamp - before.stamp, self._slope
-        if 0 < elapsed <= self._config.max_gap * SECOND:
+        if 0 < elapsed <= self._longest:
             self._period = elapsed / SECOND
-        self._slope = float(sample.acceleration[2] - before.acceleration[2]) / elapsed if elapsed > 0 else 0.0
+        rise = sample.acceleration.item(2) - before.acceleration.item(2)
+        self._slope = rise / elapsed if elapsed > 0 else 0.0
         on = self._slope != 0 and abs(self._slope - last) <= STRAIGHT * abs(self._slope)
         self._straight = self._straight + elapsed if on else 0
         if self._same is not None:
@@ -245,23 +250,24 @@ class Inertial:
         """A sample holds back to the one before it; beyond the last one, that holds on."""
         if self._from is None:
             return
-        samples = self._samples
-        while self._next < len(samples) and samples[self._next].stamp <= until:
-            self._move(self._next, samples[self._next].stamp)
+        samples, before = self._samples, self._sample(self._next - 1)
+        while self._next < len(samples) and (sample := samples[self._next]).stamp <= until:
+            self._move(sample, before, sample.stamp)
+            before = sample
             self._next += 1
         if self._at < until:
-            self._move(min(self._next, len(samples) - 1), until)
+            last = min(self._next, len(samples) - 1)
+            self._move(self._sample(last), self._sample(last - 1), until)
 
-    def _move(self, n: int, until: int) -> None:
-        """n: of the sample that holds until then; -1: the one before them."""
-        sample, before = self._sample(n), self._sample(n - 1)
+    def _move(self, sample: ImuSample, before: ImuSample, until: int) -> None:
+        """sample: the one that holds until then. before: the one before it."""
         seconds = (until - self._at) / SECOND
-        if max(sample.stamp - before.stamp, until - sample.stamp) > self._config.max_gap * SECOND:
+        if max(sample.stamp - before.stamp, until - sample.stamp) > self._longest:
             self._coast(until)
         elif seconds > 0:
-            if self._is_saturated(sample):
+            if self._ends and self._is_saturated(sample):
                 self._flaw = "imu/saturated"
-            if self._straight > self._config.max_gap * SECOND:
+            if self._straight > self._longest:
                 self._flaw = "imu/interpolated"
             assert self._measured is not None
             self._measured.integrateMeasurement(sample.acceleration, sample.rate, seconds)
@@ -296,19 +302,8 @@ class Inertial:
 
     def _renew(self, state: State) -> None:
         if self._params is None or self._config.noise == "message":
-            self._params = self._parameters()
+            self._params = parameters(self._config, self._noise(), self._mount)
         self._measured = gtsam.PreintegratedCombinedMeasurements(self._params, state.bias)
-
-    def _parameters(self) -> gtsam.PreintegrationCombinedParams:
-        noise, params = self._noise(), gtsam.PreintegrationCombinedParams.MakeSharedU(self._config.gravity)
-        params.setGyroscopeCovariance(np.eye(3) * noise.gyroscope_density**2)
-        params.setAccelerometerCovariance(np.eye(3) * noise.accelerometer_density**2)
-        params.setBiasOmegaCovariance(np.eye(3) * noise.gyroscope_walk**2)
-        params.setBiasAccCovariance(np.eye(3) * noise.accelerometer_walk**2)
-        params.setIntegrationCovariance(np.eye(3) * INTEGRATION**2)
-        if self._mount is not None:
-            params.setBodyPSensor(self._mount)
-        return params
 
     def _noise(self) -> ImuNoise:
         """As configured; by the newest sample where the messages are to tell, and do."""
@@ -383,10 +378,24 @@ def _are_alike(one: ImuSample, other: ImuSample) -> bool:
     return np.array_equal(one.acceleration, other.acceleration) and np.array_equal(one.rate, other.rate)
 
 
+def parameters(config: ImuSource, noise: ImuNoise, mount: Pose | None) -> gtsam.PreintegrationCombinedParams:
+    """Of the preintegration. mount: `base_T_sensor`; None where the sensor's frame is the base."""
+    params = gtsam.PreintegrationCombinedParams.MakeSharedU(config.gravity)
+    unit = np.eye(3)
+    params.setGyroscopeCovariance(unit * noise.gyroscope_density**2)
+    params.setAccelerometerCovariance(unit * noise.accelerometer_density**2)
+    params.setBiasOmegaCovariance(unit * noise.gyroscope_walk**2)
+    params.setBiasAccCovariance(unit * noise.accelerometer_walk**2)
+    params.setIntegrationCovariance(unit * INTEGRATION**2)
+    if mount is not None:
+        params.setBodyPSensor(mount)
+    return params
+
+
 def _variance(covariance: Array) -> float | None:
     """The mean of the three variances; None where they say nothing."""
-    variances = covariance.reshape(3, 3).diagonal()
-    return float(variances.mean()) if (variances > 0).all() and np.isfinite(variances).all() else None
+    x, y, z = covariance.tolist()[::4]
+    return (x + y + z) / 3 if all(0 < each < inf for each in (x, y, z)) else None
 
 
 def imu_of(config: Config) -> ImuSource | None:

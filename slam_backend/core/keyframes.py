@@ -22,6 +22,7 @@ from .trajectory import Stamps, Trajectory
 
 LOOSE = 1.0  # m and rad after 1 m or 1 rad: grounds are less uneven
 LOST = 3.2  # rad: nothing is known of a rotation
+MADE = 8  # poses of samples that are kept as objects
 SAMPLES_PER_STEP = 32  # odometry samples kept between two keyframes; a parked robot must not fill the memory
 
 
@@ -63,6 +64,9 @@ class Track:
         self._strands: dict[
             int, int
         ] = {}  # stamp -> strand, of samples that share no frame with the first ones
+        self._made: dict[
+            int, Pose
+        ] = {}  # of the samples asked for last, by index: a keyframe asks five times
 
     def __len__(self) -> int:
         return len(self._stamps)
@@ -75,6 +79,8 @@ class Track:
         if at and covariance is not None and self.noise.noise == "twist":
             covariance = self._filled(covariance, self._sample(at - 1).between(pose))
         self._protected += at <= self._protected < len(self._stamps)
+        if at < len(self._stamps):
+            self._made.clear()
         self._stamps.insert(at, stamp)
         numbers = self._space.numbers(pose)
         self._columns = self._columns or tuple(array("d") for _ in numbers)
@@ -129,6 +135,7 @@ class Track:
         self._stamps = array("q", samples.stamps.tolist())
         self._columns = tuple(array("d", column) for column in samples.numbers.T.tolist())
         self._covariances = list(samples.covariances)
+        self._made.clear()
         strands = zip(samples.stamps.tolist(), samples.strands.tolist(), strict=True)
         self._strands = {stamp: strand for stamp, strand in strands if strand >= 0}
         self.protect()
@@ -174,7 +181,14 @@ class Track:
         return Motion(pose, self._covariance(start, end, pose, last))
 
     def _sample(self, index: int) -> Pose:
-        return self._space.pose_of_numbers([column[index] for column in self._columns])
+        made = self._made.get(index)
+        if made is None:
+            if len(self._made) >= MADE:
+                self._made.clear()
+            made = self._made[index] = self._space.pose_of_numbers(
+                [column[index] for column in self._columns]
+            )
+        return made
 
     def _rows(self) -> Array:
         return np.ascontiguousarray(np.array(self._columns).T)
@@ -189,7 +203,8 @@ class Track:
             grown = growth(self._space, self.noise, motion)
         elif self.noise.planar:
             grown = self._space.flat(grown, *loose(self._space, motion))
-        return self._floor() + grown + self._of_leaps(start, end, last)
+        found = self._floor() + grown
+        return found + self._of_leaps(start, end, last) if self._leaps else found
 
     def _of_leaps(self, start: int, end: int, last: Pose) -> Array:
         total = np.zeros((self._space.dimension,) * 2)
@@ -251,6 +266,7 @@ class Track:
         self._drop(slice(drop.start, drop.stop, 2))
 
     def _drop(self, where: slice) -> None:
+        self._made.clear()
         del self._stamps[where]
         for column in self._columns:
             del column[where]

@@ -181,7 +181,10 @@ class Planar:
         return np.asarray(np.linalg.inv(np.linalg.inv(information)[np.ix_(axes, axes)]))
 
     def diagonal(self, variance_rotation: float, variance_translation: float) -> Array:
-        return np.diag((variance_translation, variance_translation, variance_rotation))
+        found = np.zeros((3, 3))
+        found[0, 0] = found[1, 1] = variance_translation
+        found[2, 2] = variance_rotation
+        return found
 
     def flat(self, covariance: Array, variance_rotation: float, variance_translation: float) -> Array:  # noqa: ARG002
         return covariance
@@ -282,9 +285,7 @@ class Spatial:
         return tuple(matrix[:3].ravel().tolist())  # a quaternion would not give the same bits back
 
     def pose_of_numbers(self, numbers: Sequence[float]) -> Pose:
-        matrix = np.eye(4)
-        matrix[:3] = np.reshape(numbers, (3, 4))
-        return gtsam.Pose3(matrix)
+        return gtsam.Pose3(np.array((*numbers, 0.0, 0.0, 0.0, 1.0)).reshape(4, 4))
 
     def covariance(self, ros: Array, pose: Pose) -> Array:
         return covariance_from_ros(ros.reshape(6, 6), pose.rotation().matrix())
@@ -305,7 +306,10 @@ class Spatial:
         return full
 
     def diagonal(self, variance_rotation: float, variance_translation: float) -> Array:
-        return np.diag((variance_rotation,) * 3 + (variance_translation,) * 3)
+        found = np.zeros((6, 6))
+        found[0, 0] = found[1, 1] = found[2, 2] = variance_rotation
+        found[3, 3] = found[4, 4] = found[5, 5] = variance_translation
+        return found
 
     def flat(self, covariance: Array, variance_rotation: float, variance_translation: float) -> Array:
         flat = np.diag((variance_rotation, variance_rotation, 0, 0, 0, variance_translation))

@@ -68,10 +68,14 @@ class Waiting:
         """What could not land this time."""
         self._pending += offers
 
+    def wants(self, until: int) -> bool:
+        """Whether a keyframe is wanted at a stamp up to `until`."""
+        return bool(self._asked) and self._asked[0] <= until
+
     def asked(self, until: int) -> list[int]:
         """Take the stamps up to `until` at which keyframes are wanted, in order."""
         stamps = []
-        while self._asked and self._asked[0] <= until:
+        while self.wants(until):
             stamps.append(heappop(self._asked))
         return stamps
 

@@ -36,9 +36,9 @@ KERNELS: Mapping[KernelName, Kernel | None] = {
 
 def noise_of(covariance: Array, config: Observing | None = None) -> Any:
     """The noise model of a covariance at the factor's tangent; config None: no kernel."""
-    variances = np.diag(covariance)
-    clipped = np.clip(variances, SMALLEST_SIGMA**2, LARGEST_SIGMA**2)
-    if (clipped != variances).any():
+    if not all(SMALLEST_SIGMA**2 <= each <= LARGEST_SIGMA**2 for each in covariance.diagonal().tolist()):
+        variances = np.diag(covariance)
+        clipped = np.clip(variances, SMALLEST_SIGMA**2, LARGEST_SIGMA**2)
         scale = np.sqrt(clipped / np.maximum(variances, np.finfo(float).tiny))
         covariance = covariance * scale[:, None] * scale
         np.fill_diagonal(covariance, clipped)  # a variance of zero as well

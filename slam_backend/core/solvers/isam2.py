@@ -110,13 +110,15 @@ class Isam2:
         graph, values = _graph(delta.add), _values(delta.values)
         first = self._isam.getFactorsUnsafe().size()
         params = gtsam.ISAM2UpdateParams()
-        params.removeFactorIndices = [self._slots[id_] for id_ in delta.remove]
+        if delta.remove:
+            params.removeFactorIndices = [self._slots[id_] for id_ in delta.remove]
+        kinds = {factor.kind for factor in delta.add}
         # a pixel is less linear than all else: what is off its point of linearization now is an outlier at the next frame
-        params.force_relinearize = any(factor.kind == "pixel" for factor in delta.add)
+        params.force_relinearize = "pixel" in kinds
         self._isam.update(graph, values, params)
         for i, factor in enumerate(delta.add):
             self._slots[factor.id] = first + i
-        if any(factor.kind in JOINING for factor in delta.add):
+        if kinds & JOINING:
             for _ in range(self._config.extra_updates):
                 result = self._isam.update(gtsam.NonlinearFactorGraph(), gtsam.Values(), self._force)
                 if result.getVariablesRelinearized() == 0:

@@ -1,0 +1,199 @@
+"""What each sensor costs online, beside a bare loop over gtsam.ISAM2 that is handed the same samples and factors."""
+
+from bisect import bisect_left
+from collections import defaultdict
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from pathlib import Path
+from statistics import median
+from tempfile import TemporaryDirectory
+from time import process_time
+from typing import Any
+
+import gtsam
+
+from bench.park import _parameters
+from bench.table import Row
+from slam_backend.core.backend import Backend
+from slam_backend.core.config import Config
+from slam_backend.core.graph import Decision, Delta, Estimate, Factor, total
+from slam_backend.core.inertial import ImuSample, imu_of, parameters
+from slam_backend.core.measurement import SECOND, Array, Measurement
+from slam_backend.core.solvers.isam2 import Isam2
+from slam_backend.core.space import SPACES
+from slam_backend.core.variables import estimate_in
+from slam_backend.io.configfile import configured, load_config
+from slam_backend.io.inputs import open_inputs
+from slam_backend.io.replay import settled_stream
+from slam_backend.lab.datasets import make_dataset
+from slam_backend.lab.options import Options
+from slam_backend.lab.simulate import simulate, write_simulation
+
+TITLE = "Sensors: what each costs"
+EXPLANATION = (
+    "CPU time of `Backend.add` per keyframe, records in memory, beside a bare loop over gtsam.ISAM2 of the same settings: one update per "
+    "keyframe with the same factors, IMU samples preintegrated by the loop itself, then the newest pose (velocity, bias) asked. Nothing "
+    "judges loops. Medians of alternating runs. What is above the bare loop: a state at every stamp, the track, ids, decisions, checks "
+    "of what the solver answers, a factor store from which it can be rebuilt."
+)
+CONFIGS = Path(__file__).parents[1] / "config"
+DRIVES = {  # simulated: scenario, options
+    "odometry": ("city", Options(poses=800)),
+    "odometry and IMU, 10 samples per keyframe": ("city", Options(poses=800, imu_rate=100.0)),
+    "odometry and fixes, one in 5 keyframes": ("city", Options(poses=800, gnss_every=5)),
+    "odometry and landmarks": ("warehouse", Options(poses=800)),
+}
+SETS = {  # of gtsam: name, configuration
+    "IMU and fixes, KITTI, 50 samples per keyframe": "kitti_imu_gnss",
+    "stereo pixels, KITTI": "kitti_stereo",
+}
+Sample = tuple[Array, Array, float]
+BOUND = "<= 1.3"
+PASSES = 3
+
+
+@dataclass(frozen=True, slots=True)
+class Stream:
+    config: Config
+    items: Sequence[Measurement]
+
+
+class Recorded(Isam2):
+    """Keeps the changes that it was given."""
+
+    def __init__(self, config: Config) -> None:
+        super().__init__(config, SPACES[config.space])
+        self.deltas: list[Delta] = []
+
+    def update(self, delta: Delta) -> Estimate:
+        self.deltas.append(delta)
+        return super().update(delta)
+
+
+def rows(names: Sequence[str] = (*DRIVES, *SETS)) -> list[Row]:
+    return [_row(name, *_pairs(stream)) for name, stream in _streams(names)]
+
+
+def _streams(names: Sequence[str]) -> Iterator[tuple[str, Stream]]:
+    with TemporaryDirectory() as folder:
+        for name in names:
+            if name in DRIVES:
+                scenario, options = DRIVES[name]
+                written = write_simulation(
+                    simulate(scenario, 1, options), Path(folder) / f"{scenario}{len(name)}.mcap"
+                )
+                yield name, _stream(written.bag, written.config)
+            else:
+                bag = make_dataset(SETS[name], Path(folder) / f"{SETS[name]}.mcap").path
+                yield name, _stream(bag, CONFIGS / f"{SETS[name]}.yaml")
+
+
+def _stream(bag: Path, config_file: Path) -> Stream:
+    config = configured(load_config(config_file), ("robust=[]",))
+    with open_inputs([bag]) as inputs:
+        items = list(settled_stream(inputs.stream(config), config))
+    return Stream(config, [item for item in items if not isinstance(item, Decision)])
+
+
+def _row(name: str, own: Sequence[float], bare: Sequence[float], keyframes: int) -> Row:
+    ratio = median(a / b for a, b in zip(own, bare, strict=True))
+    each, loop = (1e6 * median(seconds) / keyframes for seconds in (own, bare))
+    return Row(name, f"{each:.0f} us per keyframe", f"{loop:.0f} us bare", ratio, BOUND)
+
+
+def _pairs(stream: Stream) -> tuple[list[float], list[float], int]:
+    changes, qr = _changes(stream)
+    samples = _samples(stream, changes)
+    bare(changes, samples, stream.config, qr)  # warm
+    pairs = [(ours(stream), bare(changes, samples, stream.config, qr)) for _ in range(PASSES)]
+    return [own for own, _ in pairs], [loop for _, loop in pairs], len(changes)
+
+
+def ours(stream: Stream) -> float:
+    backend = Backend(stream.config)
+    begin = process_time()
+    for item in stream.items:
+        backend.add(item)
+    return process_time() - begin
+
+
+def _changes(stream: Stream) -> tuple[list[Delta], bool]:
+    """What was given to the solver, one change per measurement that made keyframes; and whether it has come to QR."""
+    solver, found = Recorded(stream.config), list[Delta]()
+    backend = Backend(stream.config, solver)
+    for item in stream.items:
+        if backend.add(item):
+            found.append(_whole(solver.deltas))
+        solver.deltas.clear()
+    return found, solver._qr  # noqa: SLF001  # nobody else asks
+
+
+def _whole(deltas: Sequence[Delta]) -> Delta:
+    """Without what came and went at the same keyframe."""
+    change = total(deltas)
+    gone = set(change.remove) & {factor.id for factor in change.add}
+    return replace(change, add=tuple(each for each in change.add if each.id not in gone))
+
+
+def bare(
+    changes: Sequence[Delta], samples: Mapping[int, Sequence[Sample]], config: Config, qr: bool
+) -> float:
+    """CPU seconds of the loop that one would write without us; its factors are copied, as it would make them.
+
+    qr: from the start, where Cholesky throws.
+    """
+    slots, space, params, settings = dict[str, int](), SPACES[config.space], _noise(config), _parameters()
+    settings.setFactorization("QR" if qr else "CHOLESKY")
+    isam = gtsam.ISAM2(settings)
+    begin = process_time()
+    for change in changes:
+        graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+        for n, factor in enumerate(change.add, isam.getFactorsUnsafe().size()):
+            if isinstance(factor.factor, gtsam.CombinedImuFactor):
+                _imu(factor, samples[factor.stamp], params)
+            graph.add(factor.factor.clone())
+            slots[factor.id] = n
+        for key, value in change.values.items():
+            values.insert(key, value)
+        update = gtsam.ISAM2UpdateParams()
+        update.removeFactorIndices = [slots[id_] for id_ in change.remove if id_ in slots]
+        update.force_relinearize = any(factor.kind == "pixel" for factor in change.add)
+        isam.update(graph, values, update)
+        for key in _newest(change.values):
+            estimate_in(space, isam, key)
+    return process_time() - begin
+
+
+def _imu(factor: Factor, samples: Sequence[Sample], params: Any) -> gtsam.CombinedImuFactor:
+    """The work that the factor took."""
+    bias = factor.factor.preintegratedMeasurements().biasHat()
+    measured = gtsam.PreintegratedCombinedMeasurements(params, bias)
+    for acceleration, rate, seconds in samples:
+        measured.integrateMeasurement(acceleration, rate, seconds)
+    return gtsam.CombinedImuFactor(*factor.factor.keys(), measured)
+
+
+def _noise(config: Config) -> Any:
+    imu = imu_of(config)
+    return None if imu is None else parameters(imu, imu.stated, None)
+
+
+def _samples(stream: Stream, changes: Sequence[Delta]) -> dict[int, list[Sample]]:
+    """By the stamp of the keyframe that they lead to: acceleration, rate and seconds of each."""
+    found: dict[int, list[Sample]] = defaultdict(list)
+    ends = sorted({factor.stamp for change in changes for factor in change.add})
+    for before, each in pairwise(item for item in stream.items if isinstance(item, ImuSample)):
+        if (n := bisect_left(ends, each.stamp)) < len(ends):
+            found[ends[n]].append((each.acceleration, each.rate, (each.stamp - before.stamp) / SECOND))
+    return found
+
+
+def _newest(values: Mapping[int, Any]) -> list[int]:
+    """The pose, and the velocity and bias beside it."""
+    return [key for key in values if chr(key >> 56) in "xvb"]
+
+
+if __name__ == "__main__":
+    for row in rows():
+        print(row)
