@@ -1,6 +1,6 @@
 # demo   a real log to a picture       test      quick proofs      test-all  and the long ones
 # lint   style and types               bench     measurements      docs      generated pages      clean
-# figures   those of the README, from real data
+# figures   those of the README and of docs/sensors.md, from real data
 # tf     tf2_msgs, which the ROS wheels lack
 
 # The tests speak over real DDS: with the ROS wheels, which exist for x86-64 Linux, unless a ROS install has been sourced.
@@ -28,6 +28,7 @@ demo: .venv/.stamp-base
 
 figures: demo
 	cp $(RUN)/trajectory.png docs/victoria_park.png
+	$(BIN)/python -m bench.figures
 
 venv: .venv/.stamp-$(EXTRAS)
 

@@ -32,10 +32,10 @@ def mrclam() -> list[Row]:
         return []
     made = []
     for robot, must in ((1, "<= 0.15"), (2, "<= 0.25"), (3, "<= 0.25")):
-        result, truth = _replayed(f"mrclam{robot}", folder, "mrclam.yaml")
+        result, truth = replayed(f"mrclam{robot}", folder, "mrclam.yaml")
         snapshot, known = result.snapshot, folder_of.landmarks(folder)
-        final, fit = _away(result.trajectory, truth)
-        causal, alone = (_rms(_away(each, truth)[0]) for each in (result.run.online, snapshot.odometry))
+        final, fit = laid_over(result.trajectory, truth)
+        causal, alone = (_rms(laid_over(each, truth)[0]) for each in (result.run.online, snapshot.odometry))
         points = fit(snapshot.landmarks[:, :2])
         gaps = np.linalg.norm(points - [known[name] for name in snapshot.names], axis=1)
         what, beside = f"MRCLAM robot {robot}", f"{alone:.2f} m odometry"
@@ -52,9 +52,9 @@ def victoria_park_raw() -> list[Row]:
     folder = SHARED / "victoria_park_raw"
     if not folder.exists():
         return []
-    result, truth = _replayed("victoria_park_raw", folder, "victoria_park_raw.yaml")
+    result, truth = replayed("victoria_park_raw", folder, "victoria_park_raw.yaml")
     gaps, causal, alone = (
-        _away(_at_laser(each), truth)[0]
+        laid_over(_at_laser(each), truth)[0]
         for each in (result.trajectory, result.run.online, result.snapshot.odometry)
     )
     seen = Counter(f.keys[1] for f in result.factors if f.kind == "landmark")
@@ -75,7 +75,7 @@ def victoria_park_raw() -> list[Row]:
     ]
 
 
-def _replayed(name: str, folder: Path, config: str) -> tuple[Result, Trajectory]:
+def replayed(name: str, folder: Path | None, config: str) -> tuple[Result, Trajectory]:
     with TemporaryDirectory() as place:
         made = make_dataset(name, Path(place) / "drive.mcap", folder=folder)
         assert made.truth is not None
@@ -93,7 +93,7 @@ def _at_laser(trajectory: Trajectory) -> Trajectory:
     return Trajectory(trajectory.stamps, sevens)
 
 
-def _away(trajectory: Trajectory, truth: Trajectory) -> tuple[Array, Fit]:
+def laid_over(trajectory: Trajectory, truth: Trajectory) -> tuple[Array, Fit]:
     """(N,) m at the truth's stamps, once the path is laid over it as a whole (Umeyama, PAMI 1991, in the plane); and the fit."""
     inside = (truth.stamps >= trajectory.stamps[0]) & (truth.stamps <= trajectory.stamps[-1])
     stamps, there = truth.stamps[inside], truth.sevens[inside, :2]

@@ -1,4 +1,4 @@
-"""What the README shows runs as it stands there."""
+"""What the README shows runs as it stands there; the figures of the docs are there."""
 
 import re
 import shlex
@@ -48,3 +48,16 @@ def test_the_targets_it_names_exist_and_its_links_lead_somewhere() -> None:
         assert f"\n{target}:" in makefile
     for link in re.findall(r"\]\(([^)#]+)\)", README):
         assert (ROOT / link).exists(), link
+
+
+def test_the_figures_of_the_docs_are_there_small_and_made_by_the_script() -> None:
+    from bench.figures import FIGURES, FOLDER
+
+    named = [
+        path.parent / link
+        for path in (ROOT / "docs").glob("*.md")
+        for link in re.findall(r"\]\((figures/[^)]+)\)", path.read_text())
+    ]
+    assert sorted(named) == sorted(FOLDER / f"{name}.png" for name in FIGURES)
+    assert sorted(FOLDER.iterdir()) == sorted(named)
+    assert all(figure.stat().st_size < 60_000 for figure in named)

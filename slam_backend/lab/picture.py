@@ -20,7 +20,7 @@ LAID_FLAT = 0.02  # share of the largest extent below which height is not worth 
 
 def draw(result: Result, path: Path) -> None:
     """Write a picture: left odometry alone, right the smoothed trajectory over it. Axes in metres, equal."""
-    plt = _pyplot()
+    plt = pyplot()
     snapshot = result.snapshot
     views = _views(snapshot.trajectory.sevens[:, :3])
     figure, grid = plt.subplots(len(views), 2, figsize=(14, 6.5 * len(views)), squeeze=False)
@@ -49,7 +49,7 @@ def draw(result: Result, path: Path) -> None:
     plt.close(figure)
 
 
-def _pyplot() -> Any:
+def pyplot() -> Any:
     """Without a screen, and without a word about a home directory that cannot be written."""
     logging.getLogger("matplotlib").setLevel(logging.ERROR)
     import matplotlib as mpl
