@@ -1,6 +1,6 @@
 """/diagnostics: what each input sends, what was refused, how the worker does."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from math import atan2, sqrt
 from time import monotonic
 from typing import Any
@@ -34,6 +34,7 @@ class Diagnostics:
         self._said: dict[
             tuple[str, str], tuple[int, float]
         ] = {}  # (source, rule) -> count, when it last grew
+        self._warned: set[tuple[str, str]] = set()  # source, rule: what the log has been told of
         self._publisher = node.create_publisher(DiagnosticArray, "/diagnostics", 10)
 
     def close(self) -> None:
@@ -62,6 +63,7 @@ class Diagnostics:
             for (who, rule), n in list(counts.items())
             if who == source
         }
+        self._warn(source, told)
         fit = self._state.consistency.get(source, {})
         values = {
             "topic": topic,
@@ -91,6 +93,14 @@ class Diagnostics:
         if age is None or age > SILENT:
             return WARN, "silent" if age is None else f"silent for {age:.0f} s", values
         return (*self._verdict(source, told), values)
+
+    def _warn(self, source: str, told: Iterable[str]) -> None:
+        """In the log, once: what makes a source of no use until it is mended."""
+        for id_ in told:
+            rule = rule_of(id_)
+            if rule is not None and rule.severity == "error" and (source, id_) not in self._warned:
+                self._warned.add((source, id_))
+                self._node.get_logger().warning(f"source '{source}': {id_}: {rule.what}; {rule.advice}")
 
     def _verdict(self, source: str, told: Mapping[str, int]) -> tuple[int, str]:
         """By the firewall's table: the worst of what it has said lately, and what to do about it; else whether its noise is true."""

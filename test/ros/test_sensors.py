@@ -16,6 +16,10 @@ DRIVES = {  # scenario, options, topics that are played (all of them: none named
         "square", Options(poses=200, gnss_every=5, landmarks=0, loop_rate=0.0), ("/fix",),
         {"space": "2d", "sources": ["gps"], "gps": {"kind": "gnss", "topic": "/fix"}},
     ),
+    "unmounted antenna": (
+        "square", Options(poses=100, gnss_every=5, landmarks=0, loop_rate=0.0), ("/odom", "/fix"),
+        {"space": "2d", "sources": ["wheels", "gps"], "wheels": {"kind": "odometry", "topic": "/odom"}, "gps": {"kind": "gnss", "topic": "/fix"}},
+    ),
     "IMU and fixes": (
         "spiral", Options(poses=150, gnss_every=5, imu_rate=100.0, landmarks=0, loop_rate=0.0), ("/imu", "/fix"),
         {
@@ -88,3 +92,18 @@ def test_what_a_sensor_says_live_is_what_replay_computes(backend, peer, sensed, 
     assert kind in (node.folder / "run" / "config.yaml").read_text()
     for word in ("[ERROR]", "[WARN]"):
         assert word not in node.process.output
+
+
+@pytest.mark.slow
+def test_a_sensor_that_is_of_no_use_is_said_once_in_the_log(backend, peer, sensed) -> None:
+    """Without looking at /diagnostics one learns what to configure."""
+    records, config = sensed("unmounted antenna")
+    node = backend(config)
+    peer.play(records, rate=10)
+    line = node.process.wait_for("[WARN]")
+    assert "source 'gps': gnss/unknown_frame" in line
+    assert "add it to 'extrinsics' or send it on /tf_static" in line
+    peer.spin(2)
+    summary = node.end()
+    assert summary["run_hash"] == node.replayed()["run_hash"]
+    assert node.process.output.count("[WARN]") == 1
