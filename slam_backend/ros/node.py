@@ -233,6 +233,10 @@ class BackendNode(SteadfastNode):
 
     def _end(self, session: Session) -> None:
         folder = self.data_dir / RUN
+        if session.feeder is not None and (left := session.feeder.backlog):
+            self.get_logger().info(
+                f"ending: {left} records are yet to be read, then the run is saved to {folder}"
+            )
         try:
             summary = session.end(FAREWELL)
         except SlamError as error:
