@@ -13,6 +13,7 @@ BENCHES = (
     "decode",
     "overhead",
     "park",
+    "sensors",
     "final",
     "simulated",
     "crowd",

@@ -72,7 +72,7 @@ def bare() -> float:
 
 
 def _bare_loop(steps: dict[int, Any], seen: dict[int, list[tuple[int, float, float]]]) -> None:
-    isam = gtsam.ISAM2(_parameters())
+    isam = gtsam.ISAM2(parameters())
     moved = gtsam.noiseModel.Diagonal.Sigmas(np.array([0.01, 0.002, 0.002]))
     held = gtsam.noiseModel.Isotropic.Sigma(3, 1e-3)
     pose, last = gtsam.Pose2(), 0
@@ -99,7 +99,7 @@ def _bare_loop(steps: dict[int, Any], seen: dict[int, list[tuple[int, float, flo
     isam.calculateBestEstimate()
 
 
-def _parameters() -> gtsam.ISAM2Params:
+def parameters() -> gtsam.ISAM2Params:
     defaults, params, descent = Config().isam2, gtsam.ISAM2Params(), gtsam.ISAM2GaussNewtonParams()
     params.setRelinearizeThreshold(defaults.relinearize_threshold)
     params.relinearizeSkip = defaults.relinearize_skip

@@ -13,7 +13,7 @@ from typing import Any
 
 import gtsam
 
-from bench.park import _parameters
+from bench.park import parameters as solver_parameters
 from bench.table import Row
 from slam_backend.core.backend import Backend
 from slam_backend.core.config import Config
@@ -143,17 +143,22 @@ def bare(
 
     qr: from the start, where Cholesky throws.
     """
-    slots, space, params, settings = dict[str, int](), SPACES[config.space], _noise(config), _parameters()
+    slots, space, params, settings = (
+        dict[str, int](),
+        SPACES[config.space],
+        _noise(config),
+        solver_parameters(),
+    )
     settings.setFactorization("QR" if qr else "CHOLESKY")
     isam = gtsam.ISAM2(settings)
     begin = process_time()
     for change in changes:
         graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
-        for n, factor in enumerate(change.add, isam.getFactorsUnsafe().size()):
+        for factor in change.add:
             if isinstance(factor.factor, gtsam.CombinedImuFactor):
                 _imu(factor, samples[factor.stamp], params)
             graph.add(factor.factor.clone())
-            slots[factor.id] = n
+            slots[factor.id] = len(slots)
         for key, value in change.values.items():
             values.insert(key, value)
         update = gtsam.ISAM2UpdateParams()

@@ -59,6 +59,19 @@ def test_samples_may_come_out_of_order(space):
         assert shuffled.pose(stamp).equals(straight.pose(stamp), 1e-9)
 
 
+@BOTH
+def test_a_sample_that_was_asked_for_stays_itself_when_others_come_before_it_or_go(space):
+    track = driven(space, OdometrySource())
+    asked = {n: track.pose(n * STEP) for n in range(15, 21)}
+    late = space.expmap(3 * twist_of(space))
+    track.add(10 * STEP + 1, late)
+    assert space.size(track.pose(10 * STEP + 1).between(late)) == pytest.approx((0, 0), abs=1e-12)
+    for n, pose in asked.items():
+        assert space.size(track.pose(n * STEP).between(pose)) == pytest.approx((0, 0), abs=1e-12)
+    track.forget(17 * STEP)
+    assert space.size(track.pose(19 * STEP).between(asked[19])) == pytest.approx((0, 0), abs=1e-12)
+
+
 def test_an_insertion_does_not_expose_the_sample_of_a_keyframe_to_thinning():
     space, track = SPACES["2d"], Track(SPACES["2d"], OdometrySource())
     for n in range(4):

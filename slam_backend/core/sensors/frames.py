@@ -55,10 +55,12 @@ class Poses:
         frames = list({id(frame): frame for frame, _ in flat}.values())
         rows = {id(frame): n for n, frame in enumerate(frames)}
         of = np.array([rows[id(frame)] for frame, _ in flat])
+        starts = np.cumsum([0, *(len(frame.ids) for frame in frames[:-1])])
+        at = starts[of] + np.array([row for _, row in flat])
         return Sightings(
             np.cumsum([0, *(len(track) for track in tracks[:-1])]),
             np.stack([self.of(frame).matrix() for frame in frames])[of],
-            np.stack([frame.pixels[row] for frame, row in flat]),
-            np.array([frame.sigmas[row] for frame, row in flat]),
+            np.concatenate([frame.pixels for frame in frames])[at],
+            np.concatenate([frame.sigmas for frame in frames])[at],
             np.stack([frame.covariance for frame in frames])[of],
         )

@@ -146,7 +146,7 @@ class Tracker:
         alive = {id(other) for other in self._frames}
         self._tracks = {
             track.id: track for track in self._tracks.values()
-            if id(track.newest) in alive and not (lost and any(id(each) in lost for each, _ in track.sightings))
+            if id(track.sightings[-1][0]) in alive and not (lost and any(id(each) in lost for each, _ in track.sightings))
             and (track.key is None or context.component(track.key) is not None)
             and (track.key is not None or all(map(context.kept, track.factors)))
         }  # fmt: skip
