@@ -75,7 +75,8 @@ def _lines(checkup: "Checkup") -> list[str]:
         "  ".join(word.ljust(width) for word, width in zip(row, widths, strict=True)).rstrip() for row in rows
     ]
     for topic in checkup.topics:
-        lines += [_said(finding, f"{topic.name}: ") for finding in topic.findings if topic.use]
+        told = topic.findings if topic.use else topic.findings[1:]  # why it is not used stands in the table
+        lines += [_said(finding, f"{topic.name}: ") for finding in told]
     lines += [_said(finding, "") for finding in checkup.findings]
     lines += [f"note: {note}" for note in checkup.notes]
     where = ", ".join(checkup.paths)
@@ -89,7 +90,7 @@ def _row(topic: "Topic") -> tuple[str, ...]:
     gaps = f"{topic.gaps} ({topic.longest_gap:.1f} s)" if topic.gaps else "-"
     rate = "-" if topic.rate is None else f"{topic.rate:.1f}"
     use = topic.use or f"- ({topic.findings[0].what})"
-    verdict = VERDICT[topic.severity] if topic.use else "-"
+    verdict = VERDICT[topic.severity] if topic.use or topic.severity != "note" else "-"
     return (
         topic.name, topic.type, use, str(topic.messages), rate, gaps, str(refused or "-"), topic.qos or "-", verdict,
     )  # fmt: skip

@@ -6,14 +6,16 @@ from math import acos
 
 import numpy as np
 
-from ..core.config import ImuSource
+from ..core.config import Config, ImuSource
+from ..core.firewall.rules import RULES
 from ..core.inertial import ODD, SIDEWAYS, ImuSample
 from ..core.measurement import StaticTransform
 from ..core.mounts import Mounts
 from ..core.sensors.imu import DECODERS
+from ..core.space import SPACES
 from .bags import Bag
 from .cdr import Decoder
-from .inputs import TF_STATIC, BagInputs
+from .inputs import TF_STATIC, BagInputs, Inputs, open_inputs
 
 LOOKED_AT = 200  # samples of each
 BASE = "base_link"
@@ -38,6 +40,26 @@ def sideways(inputs: BagInputs, mounts: Mounts) -> dict[str, float]:
             if what.type in DECODERS and (tilt := _tilt(list(_first(bag, topic)), mounts)) is not None:
                 found[topic] = tilt
     return {topic: tilt for topic, tilt in found.items() if tilt > SIDEWAYS}
+
+
+def leaning(inputs: Inputs, config: Config) -> list[str]:
+    """A note for each IMU on its side that a configuration does not use; of one that it uses the run itself says it."""
+    if not isinstance(inputs, BagInputs):
+        return []
+    used = {topic for source in config.sources.values() for topic in source.topics}
+    spare = {
+        topic for bag in inputs.bags for topic, what in bag.topics.items() if what.type in DECODERS
+    } - used
+    if not spare:
+        return []
+    with open_inputs(inputs.paths) as again:  # what a look into them finds damaged is not to be said twice
+        assert isinstance(again, BagInputs)
+        tilts = sideways(again, Mounts(SPACES["3d"], config.base_frame, config.extrinsics))
+    rule = RULES["imu/sideways"]
+    return [
+        f"{topic} is not used (imu/sideways): {rule.what} (tilted by {tilts[topic]:.1f} rad): {rule.advice}"
+        for topic in sorted(spare & tilts.keys())
+    ]
 
 
 def _first(bag: Bag, topic: str) -> Iterator[ImuSample]:

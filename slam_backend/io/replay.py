@@ -25,6 +25,7 @@ from ..core.trajectory import Trajectory
 from .configfile import configured, load_config
 from .discover import discover
 from .edits import NONE, Edits, kept
+from .gravity import leaning
 from .inputs import GraphInput, Inputs, open_inputs
 from .mapfile import read_map
 from .result import Result, cost
@@ -64,6 +65,7 @@ def replay(
             given = {} if config is None else config.model_dump(exclude_unset=True, exclude={"sources"})
             config = config_from({**config_to(found), **given}, "configuration")
         config = configured(config, settings)
+        notes += leaning(opened, config)
         run = Run(opened, config, notes, final, estimator, edits=edits)
         if continued is not None and saved is not None:
             run.load(continued, saved)

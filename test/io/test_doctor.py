@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from slam_backend.cli import main
 from slam_backend.core.config import config_from
 from slam_backend.core.measurement import SECOND
 from slam_backend.io.bags import open_bag, write_bag
@@ -12,6 +13,7 @@ from slam_backend.io.doctor import Checkup, examine, worst
 from slam_backend.io.encode import encode_odometry, encode_string, encode_transforms
 from slam_backend.io.qos import offered_qos
 from slam_backend.io.records import Record
+from slam_backend.io.replay import replay
 from slam_backend.io.typestore import typestore_of
 
 DATA = Path(__file__).parents[2] / "../shared/data/bags"
@@ -202,3 +204,24 @@ def test_an_imu_whose_mounting_is_told_may_lie_as_it_wants(tmp_path):
     told = mounting((0.0, 0.0, 0.0, 0.0, half, 0.0, half))  # its x axis points down
     found = checked(tmp_path, [told, *(imu(n, (-9.8, 0.2, 0.1)) for n in range(50))])
     assert not any("imu/sideways" in finding.what for topic in found.topics for finding in topic.findings)
+
+
+def test_an_imu_on_its_side_that_nothing_uses_is_said_on_the_terminal(tmp_path, capsys):
+    """By `doctor`, and by `replay` with a configuration that leaves it out."""
+    records = [*(imu(n, (9.8, 0.1, 0.2)) for n in range(50)), *(odometry(n) for n in range(20))]
+    write_bag(tmp_path / "tilted.mcap", sorted(records, key=lambda record: record.log_time))
+    assert main(["doctor", str(tmp_path / "tilted.mcap")]) == 0
+    out = capsys.readouterr().out
+    assert next(line for line in out.splitlines() if line.startswith("/imu ")).endswith("look")
+    assert "warn: /imu: imu/sideways" in out
+    wheels = config_from({"sources": ["wheels"], "wheels": {"kind": "odometry", "topic": "/odom"}})
+    (note,) = replay(tmp_path / "tilted.mcap", wheels).notes
+    assert note.startswith("/imu is not used (imu/sideways)")
+
+
+def test_an_upright_imu_is_worth_no_note(tmp_path):
+    write_bag(
+        tmp_path / "upright.mcap", [*(imu(n, (0.1, 0.2, 9.8)) for n in range(50)), *map(odometry, range(20))]
+    )
+    wheels = config_from({"sources": ["wheels"], "wheels": {"kind": "odometry", "topic": "/odom"}})
+    assert replay(tmp_path / "upright.mcap", wheels).notes == []
