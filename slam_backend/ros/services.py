@@ -121,7 +121,7 @@ class Services:
     async def _query(self, request: GetParameters.Request, response: GetParameters.Response) -> Any:
         """At once if all is known; else with the help of the worker: covariances, and a newer snapshot if one is to come."""
         found = self._known(request.names, self._state.snapshot, None)
-        if any(value is None for value in found.values()):
+        if any(value is None or _may_be_known_by_now(value) for value in found.values()):
             with suppress(SlamError):  # then it stays unknown
                 found = await self._elsewhere(
                     lambda: self._known(request.names, self.newest(), self._session_of())
@@ -329,6 +329,11 @@ def _told(
         return response
 
     return callback
+
+
+def _may_be_known_by_now(value: Value) -> bool:
+    """A place on the earth that an older snapshot did not know yet."""
+    return isinstance(value, Mapping) and "map_T_earth" in value and value["map_T_earth"] is None
 
 
 def _parameter(value: Value) -> ParameterValue:
