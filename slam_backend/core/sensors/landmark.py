@@ -4,6 +4,7 @@ from collections import defaultdict
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from math import isnan
 from typing import Any, Literal, get_args
 
@@ -20,6 +21,7 @@ from ..measurement import Array, Decoder, Measurement, Message, frozen, parse_fr
 from ..robust.kernels import noise_of
 from ..space import Space
 from ..variables import is_posed
+from .drift import Drift
 from .placing import is_due, place
 from .ranging import PLACELESS, range_factor, sighting, told
 from .tag import tag_from_keyframe, tilted
@@ -197,6 +199,7 @@ def _placed(
     newest = waits[-1].offer
     part = context.component(context.landing(newest.measurement.stamp).keyframe.pose)
     offers, sightings = [], []
+    keyframes: dict[int, Keyframe] = {}
     for wait in waits:
         m = wait.offer.measurement
         assert isinstance(m, LandmarkObservation)
@@ -206,13 +209,20 @@ def _placed(
                 seen = _in_space(m, context, config)
                 sightings.append(sighting(m.form, seen, placed, _mount(m, context, config), context))
                 offers.append(wait.offer)
-    found = place(sightings)
+                keyframes[placed.keyframe.pose] = placed.keyframe
+    found = place(sightings, lambda keys: _drift([keyframes[key] for key in keys], context))
     assert isinstance(newest.measurement, LandmarkObservation)
     decision = told(newest, newest.measurement.landmark, found, len(sightings))
     if found.point is None:
         return Delta(decisions=(decision,))
     points[key] = found.point
     return each(offers, "landmark", sight) + Delta(decisions=(decision,))
+
+
+def _drift(keyframes: Sequence[Keyframe], context: Context) -> Drift:
+    """Of the driving source, from each keyframe to the next that saw the landmark."""
+    steps = [context.motion(a.stamp, b.stamp).covariance for a, b in pairwise(keyframes)]
+    return Drift([context.pose(each.pose) for each in keyframes], steps)
 
 
 def _mount(m: LandmarkObservation, context: Context, config: LandmarkSource) -> Pose:

@@ -1,20 +1,24 @@
 """Where a landmark is that has been seen only by range or by bearing: delayed initialization.
 
-Sightings wait until they fix a place. The place is the least robust cost over all of them, the robot's poses taken as they are:
+Sightings wait until they fix a place. Places are looked for as the robot's poses are: the least robust costs over all sightings, by
 Levenberg-Marquardt from many starts at once, on a grid of directions and radii for ranges (two circles cross twice), and from the
-point nearest to all lines of sight for bearings. It is believed when
+point nearest to all lines of sight for bearings. Each minimum is then judged with the poses as uncertain as the odometry between
+them (drift.py): what lifts a robot off a plane, and tells above from below, may be nothing but drift. The best is believed when
     the next other place costs AMBIGUOUS more: of two mirror images the robot must have left the line between them,
     no direction of it is less certain than LOOSE of the distance: enough parallax,
     and the sightings agree with it: half of them to within CONTRADICTION standard deviations.
 """
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..graph import Pose
 from ..measurement import Array
+from .drift import Drift
 
 FEWEST = 2  # sightings more than a point has axes
 GROWTH = 1.25  # by which the number of sightings grows between two attempts: their cost stays linear
@@ -26,6 +30,9 @@ PER_KEYFRAME = 3  # sightings from one place that count: their errors are alike
 MOST = 200  # sightings that count at all, evenly chosen
 RADII = (0.5, 1.0, 2.0)  # of the median range, around the middle of the way
 ROUNDS = 40
+JUDGED = 6  # minima at most
+AGAIN = 10  # rounds of a minimum under the drift
+APART = 0.05  # of the distance: what is nearer is the same minimum
 NEAR = 1e-6  # m
 
 
@@ -62,23 +69,35 @@ def is_due(before: int, now: int, axes: int) -> bool:
     return before < axes + FEWEST or int(np.log(now) / np.log(GROWTH)) > int(np.log(before) / np.log(GROWTH))
 
 
-def place(sightings: list[Sighting]) -> Place:
-    rays = _Rays(_thinned(sightings))
-    points, costs = rays.descended(rays.starts())
-    order = np.argsort(costs, kind="stable")
-    best, cost = points[order[0]], float(costs[order[0]])
-    information, residuals = rays.information(best)
+class Minimum(NamedTuple):
+    """Of the cost. information: (d, d) of the point. residuals: (N,) how far each sighting is off, in standard deviations."""
+
+    point: Array
+    cost: float
+    information: Array
+    residuals: Array
+
+
+def place(sightings: list[Sighting], drift: Callable[[Sequence[int]], Drift] | None = None) -> Place:
+    """drift: of the way through these keyframes; none: their poses are exact."""
+    kept = _thinned(sightings)
+    keyframes = list(dict.fromkeys(each.keyframe for each in kept))
+    rays = _Rays(kept, keyframes)
+    way = drift(keyframes) if drift else Drift((), ())
+    found = sorted((rays.judged(point, way) for point in rays.minima()), key=lambda each: each.cost)
+    best, cost, information, residuals = found[0]
     scale = max(
         1.0, cost / len(rays.positions)
     )  # noise that is understated must not decide between two places
     reach = float(np.median(np.linalg.norm(best - rays.positions, axis=1)))
     spread = np.linalg.eigvalsh(information)[0]
     sigma = float(np.sqrt(scale / spread)) if spread > 0 else np.inf
-    others = [
-        k for k in order[1:] if np.linalg.norm(points[k] - best) > max(3 * min(sigma, reach), 0.05 * reach)
-    ]
-    margin = (float(costs[others[0]]) - cost) / scale if others else np.inf
-    second = (points[others[0]],) if others and margin < AMBIGUOUS else ()
+    near, image = min(sigma, reach), rays.fit(rays.mirrored(best), way)
+    rivals = [*((each, 3 * near) for each in found[1:]), (image, near)]
+    others = [each for each, limit in rivals if np.linalg.norm(each.point - best) > max(limit, APART * reach)]
+    others.sort(key=lambda each: each.cost)
+    margin = (others[0].cost - cost) / scale if others else np.inf
+    second = (others[0].point,) if others and margin < AMBIGUOUS else ()
     why = ""
     if not sigma <= LOOSE * reach:
         within = f"to {sigma:.2g} m" if sigma < reach else "not at all"
@@ -111,8 +130,11 @@ def _thinned(sightings: list[Sighting]) -> list[Sighting]:
 class _Rays:
     """The sightings in columns, in the map."""
 
-    def __init__(self, sightings: list[Sighting]) -> None:
+    def __init__(self, sightings: list[Sighting], keyframes: Sequence[int]) -> None:
+        """keyframes: in the order in which a Drift has them."""
         poses = [each.sensor for each in sightings]
+        numbers = {key: n for n, key in enumerate(keyframes)}
+        self._at = np.array([numbers[each.keyframe] for each in sightings])
         self.positions = np.array([pose.translation() for pose in poses])
         self.ranged = np.array([each.distance is not None for each in sightings])
         self.aimed = np.array([each.direction is not None for each in sightings])
@@ -165,12 +187,78 @@ class _Rays:
             damping = np.clip(np.where(better, damping / 5, damping * 5), 1e-9, 1e6)
         return points, costs
 
-    def information(self, point: Array) -> tuple[Array, Array]:
-        """(d, d) of a place, outliers weighed down, and (N,) how far each sighting is off, in standard deviations."""
-        residuals, jacobians = self._linear(point[None])
-        far = np.linalg.norm(residuals[0], axis=1)
+    def minima(self) -> list[Array]:
+        """The lowest first."""
+        points, costs = self.descended(self.starts())
+        order = np.argsort(costs, kind="stable")
+        reach = float(np.median(np.linalg.norm(points[order[0]] - self.positions, axis=1)))
+        found: list[Array] = []
+        for point in points[order]:
+            if len(found) < JUDGED and all(np.linalg.norm(point - each) > APART * reach for each in found):
+                found.append(point)
+        return found
+
+    def judged(self, point: Array, drift: Drift) -> Minimum:
+        """The minimum near a point, with the poses as uncertain as the drift has them; outliers are weighed down."""
+        factor = np.asarray(np.linalg.cholesky(self._noise(point, drift)))
+        best = self._under(point, factor)
+        for _ in range(AGAIN if drift.steps else 0):
+            step, *_ = np.linalg.lstsq(best.information, best.gradient, rcond=None)
+            trial = self._under(best.point - step, factor)
+            if not trial.cost < best.cost:
+                break
+            best = trial
+        return Minimum(best.point, best.cost, best.information, best.residuals)
+
+    def fit(self, point: Array, drift: Drift) -> Minimum:
+        """How well a point fits that need be no minimum."""
+        found = self._under(point, np.asarray(np.linalg.cholesky(self._noise(point, drift))))
+        return Minimum(found.point, found.cost, found.information, found.residuals)
+
+    def mirrored(self, point: Array) -> Array:
+        """In the line or plane that the way of the sensor is nearest to. Where little tells the two sides apart, there is but one
+        minimum at times, and a wrong one; what it costs to be on the other side tells.
+        """
+        middle = self.positions.mean(axis=0)
+        normal = np.linalg.svd(self.positions - middle)[2][-1]
+        return np.asarray(point - 2 * ((point - middle) @ normal) * normal)
+
+    def _under(self, point: Array, factor: Array) -> "_Whitened":
+        residuals, jacobians = (each[0] for each in self._linear(point[None]))
+        rows = self._rows()
+        whole = np.zeros(rows.shape)
+        whole[rows] = np.linalg.solve(factor, residuals[rows])
+        slopes = np.zeros(jacobians.shape)
+        slopes[rows] = np.linalg.solve(factor, jacobians[rows])
+        far = np.linalg.norm(whole, axis=1)
         weights = 1 / (1 + (far / WIDTH) ** 2)
-        return np.einsum("n,nij,nik->jk", weights, jacobians[0], jacobians[0]), far
+        cost = float((WIDTH**2 * np.log1p(far**2 / WIDTH**2)).sum())
+        information = np.einsum("n,nij,nik->jk", weights, slopes, slopes)
+        return _Whitened(point, cost, information, far, np.einsum("n,nij,ni->j", weights, slopes, whole))
+
+    def _rows(self) -> NDArray[np.bool_]:
+        """(K, d) the residuals that say something: one of a range, all of a bearing."""
+        rows = np.ones((len(self.distances) + len(self.directions), self.axes), dtype=bool)
+        rows[: len(self.distances), 1:] = False
+        return rows
+
+    def _noise(self, point: Array, drift: Drift) -> Array:
+        """(M, M) covariance of those residuals: their own, and what the drift adds."""
+        rows = self._rows()
+        order = np.concatenate([np.flatnonzero(self.ranged), np.flatnonzero(self.aimed)])
+        owner, axis = np.nonzero(rows)
+        by_place = -self._linear(point[None])[1][0][rows]
+        turn = np.zeros((len(owner), 1 if self.axes == 2 else 3))
+        aimed = owner >= len(self.distances)
+        ray = owner[aimed] - len(self.distances)
+        ahead = self.directions[ray] / self._sigma_direction[ray, None]
+        if self.axes == 2:
+            turn[aimed, 0] = np.where(axis[aimed] == 0, ahead[:, 1], -ahead[:, 0])
+        else:
+            turn[aimed] = -np.cross(ahead, np.eye(3)[axis[aimed]])
+        sightings = order[owner]
+        drifted = drift.covariance(self._at[sightings], self.positions[sightings], by_place, turn)
+        return np.asarray(np.eye(len(owner)) + drifted)
 
     def _costs(self, points: Array) -> Array:
         square = (self._linear(points)[0] ** 2).sum(axis=2)
@@ -198,6 +286,16 @@ class _Rays:
             residuals.append((seen - self.directions) / self._sigma_direction[:, None])
             jacobians.append(across / (reach[:, self.aimed] * self._sigma_direction)[..., None, None])
         return np.concatenate(residuals, axis=1), np.concatenate(jacobians, axis=1)
+
+
+class _Whitened(NamedTuple):
+    """As a Minimum, with the gradient of its cost."""
+
+    point: Array
+    cost: float
+    information: Array
+    residuals: Array
+    gradient: Array
 
 
 def _compass(axes: int) -> Array:

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from slam_backend.core.sensors.drift import Drift
 from slam_backend.core.sensors.placing import Sighting, is_due, place
 from slam_backend.core.space import SPACES
 
@@ -110,3 +111,21 @@ def test_attempts_come_at_fixed_numbers_of_sightings_so_that_windows_do_not_matt
     assert len(one_by_one) < 25
     for first, last in ((0, 400), (3, 60), (100, 399)):
         assert is_due(first, last, 2) == any(first < n <= last for n in one_by_one)
+
+
+def test_what_drift_alone_has_lifted_off_a_plane_does_not_tell_above_from_below():
+    """The robot is believed to have left the plane, and has not. Without that doubt some believe a place, on either side of it."""
+    space, rng = SPACES["3d"], np.random.default_rng(10)
+    flat = way(space, 6.0) * (1, 1, 0)
+    step, believed = space.diagonal(1e-8, 0.15**2), []
+    for _ in range(6):
+        rise = np.cumsum(rng.normal(0, 0.15, len(flat)))[:, None] * (0, 0, 1)
+        sightings = seen(space, flat, np.array([8.0, 11.0, 6.0]), rng, distance=0.05)
+        told = [
+            each._replace(sensor=space.rigid(np.eye(3), position))
+            for each, position in zip(sightings, flat + rise, strict=True)
+        ]
+        drift = Drift([each.sensor for each in told], [step] * (len(told) - 1))
+        assert place(told, lambda _, drift=drift: drift).point is None
+        believed.append(place(told).point)
+    assert any(point is not None for point in believed)
