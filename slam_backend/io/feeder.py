@@ -121,11 +121,7 @@ class Feeder:
         else:
             self._requests.append(request)
         self._journal.nudge()
-        with self._answered:
-            self._answered.wait_for(
-                lambda: self._answers[request.id] is not None or self._stop.is_set(), timeout
-            )
-            answer = self._answers.pop(request.id)
+        answer = self._awaited(request, timeout)
         if answer is None:
             why = (
                 "it has been ended"
@@ -137,10 +133,25 @@ class Feeder:
             raise SlamError(answer.error)
         return answer.content
 
+    def _awaited(self, request: Request, timeout: float) -> Answer | None:
+        """None if it did not come in time (s). As long as the worker reads on, the last one has time."""
+
+        def over() -> bool:
+            return self._answers[request.id] is not None or self._stop.is_set()
+
+        with self._answered:
+            while True:
+                applied = self._worker.applied
+                if self._answered.wait_for(over, timeout) or request is not self._last:
+                    break
+                if self._worker.applied == applied:
+                    break
+            return self._answers.pop(request.id)
+
     def finish(self, folder: str, timeout: float) -> Any:
         """Feed what is left of the journal, flush, save the run at `folder`, end the worker; the run's summary.
 
-        SlamError if that was not done in time (s). A worker that dies meanwhile gets a successor.
+        SlamError if the worker comes no further for so long (s). One that dies meanwhile gets a successor.
         """
         self.held = None
         try:

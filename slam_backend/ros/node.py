@@ -39,7 +39,7 @@ from .steadfast import SteadfastNode, explained, survived
 
 LOOK = 0.3  # s between two looks at the graph
 WATCHED = ("path", "trajectory", "landmarks", "graph")  # outputs that are made from a snapshot
-FAREWELL = 30.0  # s that the worker may take to flush and save at the end
+FAREWELL = 30.0  # s in which the worker must come further at the end, and save
 AGAIN = 5.0  # s after which the same incident is worth another line
 STEADY = Clock(clock_type=ClockType.STEADY_TIME)  # timers run whether or not /clock does
 

@@ -152,7 +152,7 @@ class Session:
     def end(self, seconds: float) -> Any:
         """Close the journal, let the worker read it to its end and save; the run's summary, None if nothing was heard.
 
-        SlamError if that did not work, or not in time (s).
+        SlamError if that did not work, or came no further for so long (s).
         """
         with self._lock:
             self._ended = True
