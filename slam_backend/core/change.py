@@ -124,14 +124,14 @@ class Change:
         """
         books, believed = self._books, self._books.estimate.values()
         calibration, remade = books.calibration, self._sensing.remade
-        vector, values, decisions = calibration.estimate(self._books.solver.factors, believed, remade, stamp)
+        vector, values, decisions = calibration.estimate(books.solver.factors, believed, remade, stamp)
         books.decisions += decisions
         if not calibration.matters(vector):
             return
         made, found = remade(vector, vector), {}
         if (
             np.abs(believed.localCoordinates(values).vector()).max()
-            > self._books.config.isam2.relinearize_threshold
+            > books.config.isam2.relinearize_threshold
         ):
             found = {key: value_in(self._space, values, key) for key in values.keys()}  # noqa: SIM118  # gtsam's Values
         if books.applier.renew(Delta(tuple(made.values()), tuple(made), found)):
@@ -142,7 +142,7 @@ class Change:
         """Join parts that have come to know enough of the same landmarks."""
         books = self._books
         while waits := books.waiting.for_a_joint():
-            found = reunion(self._space, waits, self._books.estimate, books.parts.of)
+            found = reunion(self._space, waits, books.estimate, books.parts.of)
             if found is None:
                 return
             books.waiting.used(found.waits)
@@ -177,13 +177,13 @@ class Change:
         last = books.timeline.newest
         books.newest = (last, books.track.pose(last.stamp)) if last else None
         refused = {d.id for d in (*books.decisions, *books.applier.decisions) if d.verdict == "refused"}
-        lost = {factor.id for factor in delta.add} - refused - self._books.solver.factors.keys()
+        lost = {factor.id for factor in delta.add} - refused - books.solver.factors.keys()
         books.waiting.again([offer for offer in window if offer.id in lost])
 
     def told(self, b: Keyframe, guess: Pose | None = None) -> Update:
         """The update for the newest keyframe, with the decisions since the last one."""
         books = self._books
-        pose = self._books.estimate.pose(b.pose)
+        pose = books.estimate.pose(b.pose)
         if guess is not None:
             books.revision += Shift(*self._space.size(guess.between(pose))).noticeable
         correction = pose.compose(books.track.pose(b.stamp).inverse())

@@ -1,8 +1,8 @@
 """The ROS 2 node: a lifecycle node that journals what it hears, has a worker process solve it, and publishes the answers.
 
 The way of a message: raw bytes -> journal -> worker (another process). The way back: report -> State -> a guard
-condition wakes the executor -> publishers. ~/odometry is made here, from the newest correction and the newest odometry,
-so that it never waits for the solver. No callback blocks, and none ends the node.
+condition wakes the executor -> publishers. ~/odometry is made in this process (locator.py), from the newest correction and
+the newest odometry, so that it never waits for the solver. No callback blocks, and none ends the node.
 """
 
 import threading

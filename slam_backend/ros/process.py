@@ -15,10 +15,8 @@ from .node import STEADY, BackendNode
 from .signals import wishes
 
 BEAT = 0.1  # s within which a signal is heard
-TRANSPORTS, OVER_UDP = (
-    "FASTDDS_BUILTIN_TRANSPORTS",
-    "UDPv4",
-)  # through shared memory, each process that appears would stop all publishers for 0.3 s (Fast DDS issue 6535)
+# Through shared memory each process that appears would stop all publishers for 0.3 s (Fast DDS issue 6535).
+TRANSPORTS, OVER_UDP = "FASTDDS_BUILTIN_TRANSPORTS", "UDPv4"
 
 
 def main(

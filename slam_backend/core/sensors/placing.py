@@ -70,12 +70,15 @@ def is_due(before: int, now: int, axes: int) -> bool:
 
 
 class Minimum(NamedTuple):
-    """Of the cost. information: (d, d) of the point. residuals: (N,) how far each sighting is off, in standard deviations."""
+    """Of the cost. information: (d, d) of the point. residuals: (N,) how far each sighting is off, in standard deviations.
+    gradient: (d,) of the cost, halved.
+    """
 
     point: Array
     cost: float
     information: Array
     residuals: Array
+    gradient: Array
 
 
 def place(sightings: list[Sighting], drift: Callable[[Sequence[int]], Drift] | None = None) -> Place:
@@ -85,7 +88,7 @@ def place(sightings: list[Sighting], drift: Callable[[Sequence[int]], Drift] | N
     rays = _Rays(kept, keyframes)
     way = drift(keyframes) if drift else Drift((), ())
     found = sorted((rays.judged(point, way) for point in rays.minima()), key=lambda each: each.cost)
-    best, cost, information, residuals = found[0]
+    best, cost, information, residuals, _ = found[0]
     scale = max(
         1.0, cost / len(rays.positions)
     )  # noise that is understated must not decide between two places
@@ -208,12 +211,11 @@ class _Rays:
             if not trial.cost < best.cost:
                 break
             best = trial
-        return Minimum(best.point, best.cost, best.information, best.residuals)
+        return best
 
     def fit(self, point: Array, drift: Drift) -> Minimum:
         """How well a point fits that need be no minimum."""
-        found = self._under(point, np.asarray(np.linalg.cholesky(self._noise(point, drift))))
-        return Minimum(found.point, found.cost, found.information, found.residuals)
+        return self._under(point, np.asarray(np.linalg.cholesky(self._noise(point, drift))))
 
     def mirrored(self, point: Array) -> Array:
         """In the line or plane that the way of the sensor is nearest to. Where little tells the two sides apart, there is but one
@@ -223,7 +225,7 @@ class _Rays:
         normal = np.linalg.svd(self.positions - middle)[2][-1]
         return np.asarray(point - 2 * ((point - middle) @ normal) * normal)
 
-    def _under(self, point: Array, factor: Array) -> "_Whitened":
+    def _under(self, point: Array, factor: Array) -> Minimum:
         residuals, jacobians = (each[0] for each in self._linear(point[None]))
         rows = self._rows()
         whole = np.zeros(rows.shape)
@@ -234,7 +236,7 @@ class _Rays:
         weights = 1 / (1 + (far / WIDTH) ** 2)
         cost = float((WIDTH**2 * np.log1p(far**2 / WIDTH**2)).sum())
         information = np.einsum("n,nij,nik->jk", weights, slopes, slopes)
-        return _Whitened(point, cost, information, far, np.einsum("n,nij,ni->j", weights, slopes, whole))
+        return Minimum(point, cost, information, far, np.einsum("n,nij,ni->j", weights, slopes, whole))
 
     def _rows(self) -> NDArray[np.bool_]:
         """(K, d) the residuals that say something: one of a range, all of a bearing."""
@@ -286,16 +288,6 @@ class _Rays:
             residuals.append((seen - self.directions) / self._sigma_direction[:, None])
             jacobians.append(across / (reach[:, self.aimed] * self._sigma_direction)[..., None, None])
         return np.concatenate(residuals, axis=1), np.concatenate(jacobians, axis=1)
-
-
-class _Whitened(NamedTuple):
-    """As a Minimum, with the gradient of its cost."""
-
-    point: Array
-    cost: float
-    information: Array
-    residuals: Array
-    gradient: Array
 
 
 def _compass(axes: int) -> Array:
