@@ -66,7 +66,7 @@ class Track:
         ] = {}  # stamp -> strand, of samples that share no frame with the first ones
         self._made: dict[
             int, Pose
-        ] = {}  # of the samples asked for last, by index: a keyframe asks five times
+        ] = {}  # of the samples added or asked for last, by index: a keyframe asks five times
 
     def __len__(self) -> int:
         return len(self._stamps)
@@ -86,6 +86,8 @@ class Track:
         self._columns = self._columns or tuple(array("d") for _ in numbers)
         for column, number in zip(self._columns, numbers, strict=True):
             column.insert(at, number)
+        if self._space.exact:
+            self._keep(at, pose)
         if covariance is not None:
             self._covariances.insert(at, covariance)
         if len(self._stamps) - self._protected > 2 * SAMPLES_PER_STEP:
@@ -183,12 +185,14 @@ class Track:
     def _sample(self, index: int) -> Pose:
         made = self._made.get(index)
         if made is None:
-            if len(self._made) >= MADE:
-                self._made.clear()
-            made = self._made[index] = self._space.pose_of_numbers(
-                [column[index] for column in self._columns]
-            )
+            made = self._space.pose_of_numbers([column[index] for column in self._columns])
+            self._keep(index, made)
         return made
+
+    def _keep(self, index: int, pose: Pose) -> None:
+        if len(self._made) >= MADE:
+            self._made.clear()
+        self._made[index] = pose
 
     def _rows(self) -> Array:
         return np.ascontiguousarray(np.array(self._columns).T)

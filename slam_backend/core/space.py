@@ -26,6 +26,7 @@ class Space(Protocol):
     used: tuple[int, ...]  # the axes of ROS's x y z roll pitch yaw that count
     point_dimension: int
     translation: slice  # of a pose's tangent
+    exact: bool  # a pose is the same to the last bit as the one that is made of its numbers
     identity: Pose
     between: Any  # factor classes
     prior: Any
@@ -134,6 +135,7 @@ class Planar:
     used = (0, 1, 5)
     point_dimension = 2
     translation = slice(0, 2)
+    exact = False  # gtsam keeps cosine and sine of the angle
     identity = gtsam.Pose2()
     between = gtsam.BetweenFactorPose2
     prior = gtsam.PriorFactorPose2
@@ -260,6 +262,7 @@ class Spatial:
     used = (0, 1, 2, 3, 4, 5)
     point_dimension = 3
     translation = slice(3, 6)
+    exact = True
     identity = gtsam.Pose3()
     between = gtsam.BetweenFactorPose3
     prior = gtsam.PriorFactorPose3
@@ -281,11 +284,12 @@ class Spatial:
         return (*pose.translation().tolist(), q.x(), q.y(), q.z(), q.w())
 
     def numbers(self, pose: Pose) -> tuple[float, ...]:
-        matrix = pose.matrix()
-        return tuple(matrix[:3].ravel().tolist())  # a quaternion would not give the same bits back
+        first, second, third, _ = pose.matrix().tolist()
+        return (*first, *second, *third)  # a quaternion would not give the same bits back
 
     def pose_of_numbers(self, numbers: Sequence[float]) -> Pose:
-        return gtsam.Pose3(np.array((*numbers, 0.0, 0.0, 0.0, 1.0)).reshape(4, 4))
+        a, b, c, x, d, e, f, y, g, h, i, z = numbers
+        return gtsam.Pose3(gtsam.Rot3(a, b, c, d, e, f, g, h, i), np.array((x, y, z)))
 
     def covariance(self, ros: Array, pose: Pose) -> Array:
         return covariance_from_ros(ros.reshape(6, 6), pose.rotation().matrix())
@@ -318,8 +322,8 @@ class Spatial:
         return flat
 
     def size(self, pose: Pose) -> tuple[float, float]:
-        x, y, z = pose.translation()
-        a, b, c = gtsam.Rot3.Logmap(pose.rotation())
+        x, y, z = pose.x(), pose.y(), pose.z()
+        a, b, c, _, _, _ = gtsam.Pose3.Logmap(pose).tolist()
         return sqrt(x * x + y * y + z * z), sqrt(a * a + b * b + c * c)
 
     def logmap(self, pose: Pose) -> Array:
