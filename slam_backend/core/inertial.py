@@ -5,8 +5,10 @@ Preintegration for Real-Time Visual-Inertial Odometry", T-RO 2017, in GTSAM's co
 of the biases.
 """
 
+from bisect import bisect_right
 from dataclasses import dataclass
-from math import atan2, hypot, inf
+from math import atan2, hypot, inf, sqrt
+from operator import attrgetter
 
 import gtsam
 import numpy as np
@@ -32,6 +34,7 @@ ODD = 0.5  # of gravity: what the first samples may differ from it
 SIDEWAYS = 0.8  # rad: a robot is not tilted so much where it starts; an IMU whose mounting nobody told is
 UNMEASURED = 3.0, 0.5  # m/s^2, rad/s: how the robot may have moved while its IMU did not tell
 GUESSED = 0.1  # m/s: of the velocity, in the covariance of a motion that is told without its velocity
+UNIT3, UNIT6 = np.eye(3), np.eye(6)  # asked for at every keyframe
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -90,9 +93,9 @@ class Stretch:
             acceleration, rate = UNMEASURED
             meters = acceleration * self.seconds**2 / 2 + GUESSED * self.seconds
             return Motion(pose, np.diag(np.square([rate * self.seconds] * 3 + [meters] * 3)))
-        covariance = np.array(self.measured.preintMeasCov()[:6, :6])
-        covariance[3:, 3:] += np.eye(3) * (GUESSED * self.seconds) ** 2
-        turn = np.eye(6)
+        covariance = self.measured.preintMeasCov()[:6, :6].copy()
+        covariance[3:, 3:] += UNIT3 * (GUESSED * self.seconds) ** 2
+        turn = UNIT6.copy()
         turn[3:, 3:] = pose.rotation().matrix().T  # positions are told in the axes of the start
         return Motion(pose, turn @ covariance @ turn.T)
 
@@ -101,7 +104,7 @@ class Inertial:
     """Takes samples in order of their stamps; is asked for the stretch up to a keyframe, and told what is believed there."""
 
     def __init__(self, source: str, config: ImuSource) -> None:
-        self._source, self._config = source, config
+        self._source, self._config, self._stated = source, config, config.stated
         self._longest = config.max_gap * SECOND  # ns
         self._ends = (
             config.max_rate is not None or config.max_acceleration is not None
@@ -111,11 +114,14 @@ class Inertial:
         ] = []  # since the newest keyframe; before the first, of the last seconds
         self._next = 0  # the first of them that is not integrated
         self._before: ImuSample | None = None  # the sample before them
+        self._newest: ImuSample | None = None  # of all
         self._cuttable = 0  # before this stamp no keyframe can be made any more
         self._mount: Pose | None = None
-        self._params: gtsam.PreintegrationCombinedParams | None = None
+        self._params: gtsam.PreintegrationCombinedParams | None = None  # of that mount, and of
+        self._noise: ImuNoise | None = None
         self._start: State | None = None  # at the newest keyframe
         self._from: State | None = None  # where preintegration began: there, or behind a gap
+        self._origin = gtsam.NavState()  # the same, for gtsam
         self._measured: gtsam.PreintegratedCombinedMeasurements | None = None  # since then
         self._at = 0  # stamp up to which it goes
         self._flaw = ""
@@ -137,7 +143,8 @@ class Inertial:
             self._mount, self._params = mount, None
         if self._from is None:
             self._collect(sample)
-        self._compare(sample, self._samples[-1] if self._samples else self._before or sample)
+        self._compare(sample, self._newest or sample)
+        self._newest = sample
         self._samples.append(sample)
         if len(self._samples) > KEPT:
             self._integrate(self._samples[KEPT // 2].stamp)
@@ -164,7 +171,7 @@ class Inertial:
 
     def _collect(self, sample: ImuSample) -> None:
         """Before the first keyframe: the samples of the last seconds, without a gap between them."""
-        if self._samples and sample.stamp - self._samples[-1].stamp > self._config.max_gap * SECOND:
+        if self._samples and sample.stamp - self._samples[-1].stamp > self._longest:
             self._drop(len(self._samples))
         while self._samples and sample.stamp - self._samples[0].stamp > self._config.start_time * SECOND:
             self._drop(1)
@@ -211,8 +218,7 @@ class Inertial:
 
     def begin(self, state: State | None, stamp: int) -> None:
         """A keyframe is there. state: what is believed of it; None if it has no velocity and bias."""
-        done = sum(sample.stamp <= stamp for sample in self._samples)
-        self._drop(done)
+        self._drop(bisect_right(self._samples, stamp, key=attrgetter("stamp")))
         self._next, self._at, self._flaw = 0, stamp, ""
         self._start = self._from = state
         if state is not None:
@@ -229,14 +235,19 @@ class Inertial:
     def predicted(self) -> State:
         """Where the samples that are integrated lead."""
         assert self._from is not None
-        assert self._measured is not None
-        origin = gtsam.NavState(self._from.pose, self._from.velocity)
-        found = self._measured.predict(origin, self._from.bias)
+        found = self._led()
         return State(self._at, found.pose(), np.asarray(found.velocity()), self._from.bias)
+
+    def _led(self) -> gtsam.NavState:
+        assert self._from is not None
+        assert self._measured is not None
+        return self._measured.predict(self._origin, self._from.bias)
 
     def moved(self, stamp: int) -> Pose:
         """`keyframe_T_stamp`, to a stamp that is not older than what is integrated."""
-        return self.since(stamp).pose
+        self._integrate(stamp)
+        assert self._start is not None
+        return self._start.pose.between(self._led().pose())
 
     def since(self, stamp: int) -> Stretch:
         """From the newest keyframe to such a stamp, as it is now: a keyframe may still cut it."""
@@ -301,14 +312,15 @@ class Inertial:
         self._renew(self._start)
 
     def _renew(self, state: State) -> None:
-        if self._params is None or self._config.noise == "message":
-            self._params = parameters(self._config, self._noise(), self._mount)
+        noise = self._told()
+        if self._params is None or noise != self._noise:
+            self._params, self._noise = parameters(self._config, noise, self._mount), noise
+        self._origin = gtsam.NavState(state.pose, state.velocity)
         self._measured = gtsam.PreintegratedCombinedMeasurements(self._params, state.bias)
 
-    def _noise(self) -> ImuNoise:
+    def _told(self) -> ImuNoise:
         """As configured; by the newest sample where the messages are to tell, and do."""
-        stated, config = self._config.stated, self._config
-        newest = self._samples[-1] if self._samples else self._before
+        stated, config, newest = self._stated, self._config, self._newest
         if config.noise == "preset" or newest is None:
             return stated
         period = self._period
@@ -317,9 +329,9 @@ class Inertial:
             _variance(newest.acceleration_covariance) if config.accelerometer_density is None else None
         )
         if rate is not None:
-            stated = stated._replace(gyroscope_density=float(np.sqrt(rate * period)))
+            stated = stated._replace(gyroscope_density=sqrt(rate * period))
         if acceleration is not None:
-            stated = stated._replace(accelerometer_density=float(np.sqrt(acceleration * period)))
+            stated = stated._replace(accelerometer_density=sqrt(acceleration * period))
         return stated
 
     # -- the first keyframe, and silence ---------------------------------------------------------
@@ -357,8 +369,7 @@ class Inertial:
         )
 
     def _is_alive(self, stamp: int) -> bool:
-        newest = self._samples[-1] if self._samples else self._before
-        return newest is not None and stamp - newest.stamp <= self._config.max_gap * SECOND
+        return self._newest is not None and stamp - self._newest.stamp <= self._longest
 
     def _fall_silent(self, stamp: int) -> None:
         """Only another source can make a keyframe where there are no samples."""
@@ -381,12 +392,11 @@ def _are_alike(one: ImuSample, other: ImuSample) -> bool:
 def parameters(config: ImuSource, noise: ImuNoise, mount: Pose | None) -> gtsam.PreintegrationCombinedParams:
     """Of the preintegration. mount: `base_T_sensor`; None where the sensor's frame is the base."""
     params = gtsam.PreintegrationCombinedParams.MakeSharedU(config.gravity)
-    unit = np.eye(3)
-    params.setGyroscopeCovariance(unit * noise.gyroscope_density**2)
-    params.setAccelerometerCovariance(unit * noise.accelerometer_density**2)
-    params.setBiasOmegaCovariance(unit * noise.gyroscope_walk**2)
-    params.setBiasAccCovariance(unit * noise.accelerometer_walk**2)
-    params.setIntegrationCovariance(unit * INTEGRATION**2)
+    params.setGyroscopeCovariance(UNIT3 * noise.gyroscope_density**2)
+    params.setAccelerometerCovariance(UNIT3 * noise.accelerometer_density**2)
+    params.setBiasOmegaCovariance(UNIT3 * noise.gyroscope_walk**2)
+    params.setBiasAccCovariance(UNIT3 * noise.accelerometer_walk**2)
+    params.setIntegrationCovariance(UNIT3 * INTEGRATION**2)
     if mount is not None:
         params.setBodyPSensor(mount)
     return params
@@ -395,7 +405,7 @@ def parameters(config: ImuSource, noise: ImuNoise, mount: Pose | None) -> gtsam.
 def _variance(covariance: Array) -> float | None:
     """The mean of the three variances; None where they say nothing."""
     x, y, z = covariance.tolist()[::4]
-    return (x + y + z) / 3 if all(0 < each < inf for each in (x, y, z)) else None
+    return (x + y + z) / 3 if 0 < x < inf and 0 < y < inf and 0 < z < inf else None
 
 
 def imu_of(config: Config) -> ImuSource | None:

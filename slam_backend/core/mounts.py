@@ -35,14 +35,12 @@ class Mounts:
 
     def get(self, frame: str) -> Pose | None:
         """`base_T_frame`; the space's own `identity` object for the base; None when unknown."""
-        if frame in ("", "base", self._base):
-            return self._space.identity
-        if frame not in self._found:
-            found = self.whole(frame)
-            if found is None:
-                return None
-            self._found[frame] = self._space.pose(SPATIAL.seven(found))
-        return self._found[frame]
+        found = self._found.get(frame)
+        if found is None and (whole := self.whole(frame)) is not None:
+            here = whole is SPATIAL.identity
+            found = self._space.identity if here else self._space.pose(SPATIAL.seven(whole))
+            self._found[frame] = found
+        return found
 
     def whole(self, frame: str) -> Pose | None:
         """The same in 3-D, whatever the space."""
