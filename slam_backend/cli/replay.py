@@ -76,6 +76,7 @@ def command(
 ) -> None:
     """Replay recorded logs through the same core as the live node, and write a run directory.
 
+    Ctrl-C ends the run where it is and saves it, with exit code 130; a second one leaves at once.
     With --sweep a run directory for each combination of the values, and a comparison with the first of them.
     """
     if final == "batch" and estimator != "isam2":
@@ -96,6 +97,8 @@ def command(
         typer.echo(json.dumps(result.summary))
     else:
         _report(result.run, target)
+    if result.run.ended == "interrupted":
+        raise typer.Exit(130)
 
 
 @dataclass(frozen=True)
@@ -122,6 +125,7 @@ def work(job: Job, shown: "Progress") -> "Result":
     from ..io.rundir import prepare
     from ..lab.ekf import ESTIMATORS
     from ..lab.viewer import Viewer
+    from .interrupt import interruptible
 
     prepare(job.out)
     with blaming(job.config):
@@ -131,7 +135,8 @@ def work(job: Job, shown: "Progress") -> "Result":
         )
         history = History(run)
         viewer = Viewer(run, job.rerun) if job.rerun else None
-        watch(run, [history.see, *([viewer.see] if viewer else [])], shown)
+        with interruptible(run.stop):
+            watch(run, [history.see, *([viewer.see] if viewer else [])], shown)
     write(run.result, history, job.out, job.report, job.bag)
     if viewer:
         viewer.finish()
@@ -165,10 +170,10 @@ def write(result: "Result", history: "History", out: Path, report: bool, bag: "W
 def aside(job: Job) -> str:
     """`work` in a process of its own: what went wrong, in one line."""
     try:
-        work(job, silent)
+        run = work(job, silent).run
     except (SlamError, OSError) as error:
         return str(error)
-    return ""
+    return "interrupted" if run.ended == "interrupted" else ""
 
 
 def _sweep(job: Job, sweeps: "Sequence[str]", as_json: bool) -> None:

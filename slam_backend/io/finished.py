@@ -5,6 +5,7 @@ import json
 from collections.abc import Collection, Mapping
 from functools import cached_property
 from io import StringIO
+from itertools import takewhile
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -28,7 +29,7 @@ from .history import Recorded
 from .inputs import open_inputs
 from .linearized import Linearized
 from .past import Past, Then
-from .replay import Final, Run, replay, settled_stream
+from .replay import WHOLE, Cut, Final, Run, replay, settled_stream
 from .rundir import ORIENTATION
 from .states import NAME as STATES
 from .states import read_states
@@ -244,12 +245,15 @@ class FinishedRun:
         """A replay of its inputs to the same end; edits: others than its own. BadFile if they are not there any more."""
         final: Final = "batch" if self.summary.get("batch") else "none"
         done = self.edits if edits is None else edits
-        return replay(self._inputs, self.config, final=final, edits=done, continued=self._continued)
+        return replay(
+            self._inputs, self.config, final=final, edits=done, continued=self._continued, cut=self._cut
+        )
 
     def numbers(self, ids: Collection[str], dropped: Collection[int]) -> dict[str, int]:
         """Which measurements of the inputs, in order of arrival, have these ids in a run without those that are dropped."""
         with open_inputs(self._inputs) as inputs:
-            return arrivals(inputs.stream(self.config), self.config, dropped, ids, settled_stream)
+            known = takewhile(lambda _: inputs.read <= self._cut.records, inputs.stream(self.config))
+            return arrivals(known, self.config, dropped, ids, settled_stream)
 
     def compare(self, run: Run) -> None:
         """BadFile where a whole replay took another way than the run itself."""
@@ -270,6 +274,12 @@ class FinishedRun:
         return paths
 
     @property
+    def _cut(self) -> Cut:
+        """Where its inputs ended for it."""
+        ended = self.summary.get("ended", "input")
+        return WHOLE if ended == "input" else Cut(self.summary["counts"]["records"], ended == "interrupted")
+
+    @property
     def _continued(self) -> Path | None:
         """The run whose map it goes on in."""
         continued = self.summary.get("continued")
@@ -277,8 +287,8 @@ class FinishedRun:
 
     @cached_property
     def _past(self) -> Past:
-        paths, dropped = self._inputs, Edits(self.edits.dropped)
-        return Past(lambda: replay(paths, self.config, edits=dropped, continued=self._continued))
+        paths, dropped, cut = self._inputs, Edits(self.edits.dropped), self._cut
+        return Past(lambda: replay(paths, self.config, edits=dropped, continued=self._continued, cut=cut))
 
     def _compare(self, stamp: int) -> None:
         """What the replay believed of each keyframe when it was newest with what the run itself did."""

@@ -22,7 +22,7 @@ from ..core.query import Unknown
 from .feeder import undisturbed
 from .inputs import open_inputs
 from .past import Past
-from .replay import Run
+from .replay import Cut, Run
 
 PATIENCE = 600.0  # s that a replay to the moment in question may take
 IDLE = 30.0  # s without a question after which the journal is let go
@@ -111,7 +111,7 @@ def serve(pipe: Connection, journal: Path, config: Config) -> None:
     os.nice(NICE)
 
     def begin() -> Run:
-        return Run(open_inputs([journal]), config, [], flush=False)
+        return Run(open_inputs([journal]), config, [], cut=Cut(flush=False))
 
     past = Past(begin)
     with suppress(EOFError, OSError):

@@ -2,9 +2,10 @@
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import cached_property
+from math import inf
 from pathlib import Path
 from time import perf_counter
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
@@ -31,8 +32,21 @@ from .mapfile import read_map
 from .result import Result, cost
 
 Final = Literal["none", "batch"]
+Ended = Literal["input", "interrupted", "saved"]
 Estimator = Callable[[Config, Space], Solver]
 RECENT = 500  # updates
+
+
+class Cut(NamedTuple):
+    """records: of the inputs, that are read before they are taken to end. flush: what waits for its turn by then is applied, and the
+    run ends; without it, it stands there as it stood while they came.
+    """
+
+    records: float = inf
+    flush: bool = True
+
+
+WHOLE = Cut()
 
 
 def replay(
@@ -43,13 +57,14 @@ def replay(
     estimator: Estimator = SOLVERS["isam2"],
     edits: Edits = NONE,
     continued: Path | None = None,
+    cut: Cut = WHOLE,
 ) -> "Run":
     """Replay bags, journals or a pose graph. Iterate the Run for its updates, or ask for its `result`.
 
     config: without one, or without sources in it, these are found by the types of the topics. settings: `key=value`, applied
     to what was found. final: `batch` ends at the optimum of the kept factors. estimator: makes the solver that takes the
     factors. edits: what was done to the run before. continued: a run directory, whose map the inputs go on in; its
-    configuration serves if none is given. SlamError says what is wrong with the input.
+    configuration serves if none is given. cut: where the inputs are taken to end. SlamError says what is wrong with the input.
     """
     paths = [inputs] if isinstance(inputs, Path | str) else list(inputs)
     saved = None if continued is None else read_map(continued)
@@ -66,7 +81,7 @@ def replay(
             config = config_from({**config_to(found), **given}, "configuration")
         config = configured(config, settings)
         notes += leaning(opened, config)
-        run = Run(opened, config, notes, final, estimator, edits=edits)
+        run = Run(opened, config, notes, final, estimator, cut, edits)
         if continued is not None and saved is not None:
             run.load(continued, saved)
     except BaseException:
@@ -99,11 +114,11 @@ class Run:
         notes: list[str],
         final: Final = "none",
         estimator: Estimator = SOLVERS["isam2"],
-        flush: bool = True,
+        cut: Cut = WHOLE,
         edits: Edits = NONE,
     ) -> None:
-        """flush: at the end of the input all is applied that still waits for its turn. edits: what is left out, and done at the end."""
-        self.config, self.notes, self.inputs = config, notes, inputs
+        """cut: where the inputs are taken to end. edits: what is left out, and done at the end."""
+        self.config, self.inputs, self._notes = config, inputs, notes
         self._final, self.edits = final, Edits(edits.dropped)
         self._to_do = edits.commands
         self.batch: Solution | None = None
@@ -116,7 +131,8 @@ class Run:
         self.last: Update | None = None
         self.reached = 0  # the newest stamp that has been applied
         self._watermark = -FAR
-        self._flush = flush
+        self._cut = cut
+        self._is_cut = self._is_over = False
         self._items = self._stream()
         self._ahead: Measurement | Decision | None = None  # the head of the stream, not applied yet
         self._online: list[tuple[int, tuple[float, ...]]] = []
@@ -125,6 +141,29 @@ class Run:
 
     def __iter__(self) -> Iterator[Update]:
         return self._updates
+
+    def stop(self) -> None:
+        """Read no further: the run ends with what has been read, as a recording does that was cut there."""
+        self._cut = self._cut._replace(records=self.inputs.read)
+
+    @property
+    def ended(self) -> Ended:
+        """input: at the end of its inputs. interrupted: before that. saved: not at all, what is asked of it is its state while they come."""
+        if not self._is_over:
+            return "saved"
+        return "interrupted" if self._is_cut else "input"
+
+    @property
+    def records(self) -> int:
+        """How many of the inputs are in it."""
+        return int(min(self.inputs.read, self._cut.records))
+
+    @property
+    def notes(self) -> list[str]:
+        """What people should know of it, a line each."""
+        if self.ended != "interrupted":
+            return self._notes
+        return [*self._notes, f"interrupted: it ends after {self.records} of {self.inputs.count} records"]
 
     def load(self, run: Path, saved: SavedMap) -> None:
         """Go on in the map of a finished run. SlamError if that cannot be."""
@@ -183,13 +222,23 @@ class Run:
     def _run(self) -> Iterator[Update]:
         start = perf_counter()
         yield from self._advance(FAR)
-        yield from self._finish()
+        if self._cut.flush:
+            yield from self._finish()
+        for asked in self._to_do:
+            yield from self.edit(asked)
         self.seconds.wall = perf_counter() - start
 
     def _stream(self) -> Iterator[Measurement | Decision]:
         with self.inputs:
-            items = kept(self.inputs.stream(self.config), self.edits.dropped)
-            yield from settled_stream(items, self.config, self._flush, self._passed)
+            items = kept(self._read(), self.edits.dropped)
+            yield from settled_stream(items, self.config, self._cut.flush, self._passed)
+
+    def _read(self) -> Iterator[Measurement | Decision]:
+        for item in self.inputs.stream(self.config):
+            if self.inputs.read > self._cut.records:
+                self._is_cut = True
+                return
+            yield item
 
     def _passed(self, watermark: int) -> None:
         self._watermark = watermark
@@ -243,9 +292,8 @@ class Run:
             raise BadFile(_nothing(self))
         self._online_cost = cost(self.backend.solver.factors.values(), self.backend.estimate.values())
         self._settle()
+        self._is_over = True
         self.seconds.solve(perf_counter() - before, 0)
-        for asked in self._to_do:
-            yield from self.edit(asked)
 
     def _settle(self) -> None:
         self.backend.polish()

@@ -75,12 +75,13 @@ class Result:
                 format_stamp(int(s)) for s in (*self.trajectory.stamps[:1], *self.trajectory.breaks)
             ],
             "input": [str(path.absolute()) for path in run.inputs.paths],
+            "ended": run.ended,
             "run_hash": run_hash(self.factors, self.decisions, self.values, self.trajectory.sevens),
             "config_hash": config_hash(run.config),
             "seed": 0,
             "estimator": run.backend.solver.name,
             "counts": {
-                "records": run.inputs.read,
+                "records": run.records,
                 "measurements": run.measurements,
                 "keyframes": len(self.trajectory),
                 "landmarks": len(self.snapshot.names),

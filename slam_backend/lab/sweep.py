@@ -2,7 +2,7 @@
 
 import os
 from collections.abc import Callable, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from itertools import product
 from multiprocessing import get_context
@@ -47,12 +47,30 @@ def in_processes(work: Callable[[Job], str], jobs: Sequence[Job], done: Callable
     """
     answers = [""] * len(jobs)
     count = min(len(jobs), os.cpu_count() or 1)
+    left = enumerate(jobs)
+    running: dict[Future[str], int] = {}
     with ProcessPoolExecutor(count, mp_context=get_context("spawn")) as pool:
-        waiting = {pool.submit(work, job): n for n, job in enumerate(jobs)}
-        for future in as_completed(waiting):
-            try:
-                answers[waiting[future]] = future.result()
-            except BrokenProcessPool:
-                answers[waiting[future]] = "its process died (out of memory?)"
-            done()
-    return answers
+        while True:
+            while len(running) < count and (
+                each := next(left, None)
+            ):  # no queue, that would go on after Ctrl-C
+                running[_submitted(pool, work, each[1])] = each[0]
+            if not running:
+                return answers
+            for future in wait(running, return_when=FIRST_COMPLETED).done:
+                n = running.pop(future)
+                try:
+                    answers[n] = future.result()
+                except BrokenProcessPool:
+                    answers[n] = "its process died (out of memory?)"
+                done()
+
+
+def _submitted(pool: ProcessPoolExecutor, work: Callable[[Job], str], job: Job) -> "Future[str]":
+    """Failed already where the pool is broken."""
+    try:
+        return pool.submit(work, job)
+    except BrokenProcessPool as broken:
+        failed: Future[str] = Future()
+        failed.set_exception(broken)
+        return failed

@@ -13,6 +13,7 @@ import pytest
 
 from slam_backend.core.command import TOPIC, TYPE, command, text_of
 from slam_backend.core.errors import SlamError
+from slam_backend.core.query import Unknown
 from slam_backend.core.trajectory import Snapshot
 from slam_backend.io.bags import open_bag
 from slam_backend.io.configfile import load_config
@@ -217,6 +218,27 @@ def test_paused_it_keeps_records_and_answers(stage, drive) -> None:
     stage.until(lambda: stage.feeder.backlog == 0)
     stage.feeder.pause(True)  # and the end does not wait for anybody to go on
     assert stage.finish()["run_hash"] == summary["run_hash"]
+
+
+def test_a_run_that_is_saved_while_its_inputs_come_can_be_made_again_and_edited(stage, drive) -> None:
+    """Whatever has come since: its journal is read as far as it was then, and nothing is settled that still waited."""
+    records, folder = drive[1], stage.folder / "early"
+    stage.append(records[:350])
+    stage.until(stage.has_read(350))
+    told = stage.feeder.request("save", str(folder))
+    stage.append(records[350:])
+    assert stage.finish()["ended"] == "input"
+    saved = FinishedRun(folder)
+    assert (told["ended"], told["counts"]["records"]) == ("saved", 350)
+    again = saved.again()
+    assert again.result.summary["run_hash"] == told["run_hash"]
+    saved.compare(again)
+    loop = next(d for d in again.decisions if d.ends is not None and d.verdict == "accepted")
+    for _ in again.edit(command("after the end 1", "edit", {"disable": [loop.id]})):
+        pass
+    assert again.result.summary["counts"]["factors"] == told["counts"]["factors"] - 1
+    with pytest.raises(Unknown, match="the input ends at"):
+        saved.past(again.reached + 10**9)
 
 
 def test_paused_a_dead_worker_gets_a_successor_that_knows_as_much(stage, drive) -> None:

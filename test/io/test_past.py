@@ -14,7 +14,7 @@ from slam_backend.io.configfile import load_config
 from slam_backend.io.finished import FinishedRun
 from slam_backend.io.inputs import open_inputs
 from slam_backend.io.past import Past
-from slam_backend.io.replay import Run, replay
+from slam_backend.io.replay import Cut, Run, replay
 from slam_backend.io.rundir import write_run
 from slam_backend.io.typestore import typestore_of
 from slam_backend.lab.simulate import Options, simulate, write_simulation
@@ -77,7 +77,7 @@ def test_the_belief_at_t_is_that_of_an_input_which_is_cut_when_the_watermark_pas
         come = [record for record, _, _ in used[: passing + 1]]
         write_bag(tmp_path / f"{n}.mcap", come)
         with open_inputs([tmp_path / f"{n}.mcap"]) as inputs:
-            cut = Run(inputs, those_in(config, come), [], flush=False)
+            cut = Run(inputs, those_in(config, come), [], cut=Cut(flush=False))
             assert cut.reach(t)
             assert_same(finished.past(t).snapshot, cut.backend.snapshot())
 
