@@ -60,6 +60,8 @@ class Applier:
         if factor.kind == "pose":
             part = self._parts.of(factor.keys[0])
             return part is not None and self._parts.is_loose(part)
+        if len(self._parts) < 2:
+            return False
         posed = factor.kind == "earth" or all(map(is_pose, factor.keys))
         return posed and len(self._parts_of(factor)) == 2
 

@@ -240,15 +240,19 @@ class Backend:
         by_imu, stretch = books.imu == books.driver, drive.stretched(stamp)
         if by_imu and stretch is None:
             return []
-        b, delta = drive.start(stamp) if a is None else (self._growth.follow(a, stamp), Delta())
-        delta += self._sensing.motion(stamp, a, b)
+        b, begun = drive.start(stamp) if a is None else (self._growth.follow(a, stamp), None)
+        motion = self._sensing.motion(stamp, a, b)
+        delta = motion if begun is None else begun + motion
         if by_imu and stretch is not None:
             drive.follow(stretch)
         books.newest = (b, books.track.pose(stamp))
         books.track.protect()
         window = books.waiting.window(stamp)
         others = [Offer("", Measurement(stamp, books.imu))] if stretch is not None and not by_imu else []
-        delta += Delta(drive.edges_beside()) + self._sensing.factors(others + window, a, b, delta.values)
+        if edges := drive.edges_beside():
+            delta += Delta(edges)
+        if others or window:
+            delta += self._sensing.factors(others + window, a, b, delta.values)
         updates = self._change.apply(b, delta, [b], window)
         drive.begun(b, stretch)
         return updates

@@ -87,7 +87,8 @@ class Change:
     ) -> list[Update]:
         """Solve: motion and all that nothing judges first, then what the robust stages let in."""
         books, waiting = self._books, self._books.waiting
-        delta += Delta(tuple(priors(self._floor, new)))
+        if held := tuple(priors(self._floor, new)):
+            delta += Delta(held)
         books.decisions += delta.decisions
         books.decisions += [told for each in delta.waits for told in waiting.wait(each)]
         window = [*window, *waiting.landed(delta.values, {factor.id for factor in delta.add})]

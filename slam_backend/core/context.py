@@ -139,15 +139,16 @@ def pose_covariance(
     space: Space, ros: Array, pose: Pose, sigma_rotation: float, sigma_translation: float
 ) -> Array:
     """(36,) in ROS order to the tangent of `pose`; zero variances take the defaults before the axes are turned."""
-    defaults = np.diag((sigma_translation**2,) * 3 + (sigma_rotation**2,) * 3)
+    defaults = (sigma_translation**2,) * 3 + (sigma_rotation**2,) * 3
     return space.covariance(defaulted(ros.reshape(6, 6), defaults), pose)
 
 
-def defaulted(covariance: Array, defaults: Array) -> Array:
+def defaulted(covariance: Array, variances: Sequence[float]) -> Array:
     """A covariance whose zero or NaN variances are replaced by the configured ones."""
-    missing = ~(np.diag(covariance) > 0)
-    if not missing.any():
+    known = [each > 0 for each in covariance.diagonal().tolist()]
+    if all(known):
         return covariance
-    filled = np.where(missing[:, None] | missing[None, :], 0.0, covariance)
-    filled[missing, missing] = defaults[missing, missing]
+    kept = np.array(known)
+    filled = np.where(kept[:, None] & kept, covariance, 0.0)
+    filled[~kept, ~kept] = np.array(variances)[~kept]
     return filled

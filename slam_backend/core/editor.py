@@ -169,8 +169,10 @@ class Editor:
         self._known.update((factor.id, factor) for factor in delta.add)  # as a stage may have made it anew
         self._wanted |= dict.fromkeys(delta.remove, False) | {factor.id: True for factor in delta.add}
         stays = [id_ for id_ in delta.remove if id_ in wishes.forced or id_ not in held]
-        left = held.keys() - (set(delta.remove) - set(stays))
-        overruled = {f.id: f for f in delta.add if f.id in wishes.out or f.id in left}
+        leaves = set(delta.remove) - set(stays)
+        overruled = {
+            f.id: f for f in delta.add if f.id in wishes.out or (f.id in held and f.id not in leaves)
+        }
         decisions: list[Decision] = []
         for id_ in (*overruled, *(id_ for id_ in stays if id_ in self._known)):
             told = self._decision(self._known[id_], "edited")

@@ -65,9 +65,9 @@ class Fixes:
         withheld |= every is not None and (tally.told + 1) % every == 0
         newest, status = max((tally.newest, tally.status), (fix.stamp, fix.status))
         self._tallies[fix.source] = Tally(tally.told + 1, tally.withheld + withheld, newest, status)
-        variances = np.diag(stated(fix, config))
+        x, y, z = stated(fix, config).diagonal().tolist()
         self._stamps.append(fix.stamp)
-        self._numbers.extend((*fix.place.tolist(), (variances[:2].mean()) ** 0.5, variances[2] ** 0.5))
+        self._numbers.extend((*fix.place.tolist(), ((x + y) / 2) ** 0.5, z**0.5))
         self._who.append(self._kinds.setdefault((fix.source, fix.frame), len(self._kinds)))
         self._withheld.append(withheld)
         return not withheld

@@ -22,8 +22,11 @@ class Keyframe:
     pose: int  # the key X(index)
 
 
+FIRST = int(X(0))  # gtsam counts a symbol's index up from there
+
+
 def keyframe(index: int, stamp: int) -> Keyframe:
-    return Keyframe(index, stamp, int(X(index)))
+    return Keyframe(index, stamp, FIRST + index)
 
 
 EARTH = int(gtsam.symbol("e", 0))  # east, north, up at an origin, in the map: see sensors/gnss.py

@@ -14,6 +14,7 @@ class Jury:
 
     def __init__(self, stages: Sequence[Robust], applier: Applier, editor: Editor) -> None:
         self.stages, self._applier, self._editor = stages, applier, editor
+        self._kinds = frozenset[str]().union(*(stage.kinds for stage in stages))
         self._undecided: dict[str, Decision] = {}  # what a stage thinks over: what those before it found
         self.decisions: list[Decision] = []
 
@@ -22,7 +23,7 @@ class Jury:
 
     def judges(self, kind: str) -> bool:
         """Whether factors of that kind are judged."""
-        return any(kind in stage.kinds for stage in self.stages)
+        return kind in self._kinds
 
     def take_decisions(self) -> list[Decision]:
         taken, self.decisions = self.decisions, []
@@ -30,10 +31,13 @@ class Jury:
 
     def hear(self, proposed: Delta) -> None:
         """Judge what is proposed, then let each stage review what it said before. SolverFailure as of the applier."""
-        self._editor.offered(proposed.add)
-        self._admit(proposed, self.stages)
+        if proposed:
+            self._editor.offered(proposed.add)
+            self._admit(proposed, self.stages)
         for stage in self.stages:
             amendment, decisions = stage.review(self._believed)
+            if not amendment and not decisions:
+                continue
             added = {factor.id for factor in amendment.add}
             decisions = tuple(self._with_basis(each) for each in decisions)
             self.decisions += [each for each in decisions if each.id not in added]

@@ -54,6 +54,7 @@ class Track:
 
     def __init__(self, space: Space, noise: OdometrySource) -> None:
         self._space, self.noise = space, noise
+        self._floor = space.diagonal(noise.sigma_rotation_floor**2, noise.sigma_translation_floor**2)
         self._stamps = array("q")
         self._columns: tuple[
             array[float], ...
@@ -207,7 +208,7 @@ class Track:
             grown = growth(self._space, self.noise, motion)
         elif self.noise.planar:
             grown = self._space.flat(grown, *loose(self._space, motion))
-        found = self._floor() + grown
+        found = self._floor + grown
         return found + self._of_leaps(start, end, last) if self._leaps else found
 
     def _of_leaps(self, start: int, end: int, last: Pose) -> Array:
@@ -218,10 +219,6 @@ class Track:
                 adjoint = last.between(self.pose(min(after, end))).AdjointMap()
                 total += share * (adjoint @ covariance @ adjoint.T)
         return total
-
-    def _floor(self) -> Array:
-        noise = self.noise
-        return self._space.diagonal(noise.sigma_rotation_floor**2, noise.sigma_translation_floor**2)
 
     def _filled(self, step: Array, motion: Pose) -> Array:
         """The covariance of a step with the model's growth where a variance is zero."""

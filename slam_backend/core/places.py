@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from math import sqrt
 
 import gtsam
 import numpy as np
@@ -35,10 +36,10 @@ def place_of(factor: Factor, estimate: Estimate) -> Array:
 
 def sigma_of(factor: Factor, space: Space) -> float:
     """m, of the position that a sighting states: its bearing acts across, at its range."""
-    sigmas = np.sqrt(np.diag(without_kernel(factor.factor.noiseModel()).covariance()))
+    variances = without_kernel(factor.factor.noiseModel()).covariance().diagonal().tolist()
     if isinstance(factor.factor, TAGS):
-        return float(sigmas[space.translation].max())
-    return float(np.hypot(sigmas[-1], sigmas[:-1].max() * factor.factor.measured().range()))
+        return sqrt(max(variances[space.translation]))
+    return sqrt(variances[-1] + max(variances[:-1]) * factor.factor.measured().range() ** 2)
 
 
 def spread(points: Array) -> float:

@@ -160,7 +160,8 @@ class Quarantine:
             place = self._space.translation
             off = factor.factor.unwhitenedError(values)[place]
             return float(off @ np.linalg.solve(noise.covariance()[place, place], off))
-        return float(np.sum(noise.whiten(factor.factor.unwhitenedError(values)) ** 2))
+        white = noise.whiten(factor.factor.unwhitenedError(values))
+        return float(white @ white)
 
     # -- places ----------------------------------------------------------------------------------
 

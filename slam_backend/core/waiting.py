@@ -92,8 +92,11 @@ class Waiting:
         return self._take(lambda measurement: measurement.source == source)
 
     def _take(self, wanted: Callable[[Measurement], bool]) -> list[Offer]:
-        taken = [offer for offer in self._pending if wanted(offer.measurement)]
-        self._pending = [offer for offer in self._pending if not wanted(offer.measurement)]
+        taken: list[Offer] = []
+        kept: list[Offer] = []
+        for offer in self._pending:
+            (taken if wanted(offer.measurement) else kept).append(offer)
+        self._pending = kept
         return taken
 
     def wait(self, wait: Wait) -> list[Decision]:

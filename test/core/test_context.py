@@ -63,7 +63,7 @@ def test_each_measurement_becomes_a_factor_a_wait_or_a_decision():
 
 
 def test_variances_that_are_zero_or_nan_are_replaced_with_what_correlates_with_them():
-    defaults = np.diag([9.0, 16.0, 25.0])
+    defaults = (9.0, 16.0, 25.0)
     full = np.array([[1.0, 0.5, 0.1], [0.5, 1.0, 0.2], [0.1, 0.2, 1.0]])
     assert defaulted(full, defaults) is full
     zero, nan = full.copy(), full.copy()
@@ -73,5 +73,5 @@ def test_variances_that_are_zero_or_nan_are_replaced_with_what_correlates_with_t
         np.testing.assert_array_equal(
             defaulted(partly, defaults), [[1.0, 0.0, 0.1], [0.0, 16.0, 0.0], [0.1, 0.0, 1.0]]
         )
-    np.testing.assert_array_equal(defaulted(np.zeros((3, 3)), defaults), defaults)
+    np.testing.assert_array_equal(defaulted(np.zeros((3, 3)), defaults), np.diag(defaults))
     assert zero[1, 1] == 0.0

@@ -124,12 +124,12 @@ def _joined(guess: Pose, window: Sequence[Offer], b: Keyframe, context: Context)
 
 def enu(places: Array, origin: Sequence[float]) -> Array:
     """(..., 3) m east, north and up of the origin; both in degrees and m."""
-    return np.stack(pymap3d.geodetic2enu(*np.moveaxis(places, -1, 0), *origin), axis=-1)
+    return np.array(pymap3d.geodetic2enu(*places.T, *origin)).T
 
 
 def geodetic(points: Array, origin: Sequence[float]) -> Array:
     """The inverse of `enu`."""
-    return np.stack(pymap3d.enu2geodetic(*np.moveaxis(points, -1, 0), *origin), axis=-1)
+    return np.array(pymap3d.enu2geodetic(*points.T, *origin)).T
 
 
 def _factor(offer: Offer, context: Context, config: GnssSource) -> Factor | Wait:
@@ -151,7 +151,7 @@ def _factor(offer: Offer, context: Context, config: GnssSource) -> Factor | Wait
     # The tangent of the error is at the keyframe; that of the noise at the antenna, where only translations are measured.
     rows = keyframe_T_antenna.inverse().AdjointMap()[space.translation]
     root = np.zeros((space.dimension,) * 2)
-    root[:size] = np.linalg.inv(np.linalg.cholesky(covariance)) @ rows
+    root[:size] = gtsam.noiseModel.Gaussian.Covariance(covariance).R() @ rows
     noise = with_kernel(gtsam.noiseModel.Gaussian.SqrtInformation(root, False), config)
     measured = measured.compose(keyframe_T_antenna.inverse())
     if context.has_datum:
@@ -162,6 +162,8 @@ def _factor(offer: Offer, context: Context, config: GnssSource) -> Factor | Wait
 
 def stated(m: Fix, config: GnssSource) -> Array:
     """(3, 3) of the message, zeros and NaN replaced by the defaults, never more certain than the floor."""
+    if all(0 < each >= config.sigma_floor**2 for each in m.covariance.diagonal().tolist()):
+        return m.covariance
     variances = np.diag(m.covariance)
     known = variances > 0
     covariance = np.where(known[:, None] & known, m.covariance, 0.0)

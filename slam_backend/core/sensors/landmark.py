@@ -36,6 +36,10 @@ NEAREST = 1e-6  # m; nearer, a landmark has no direction
 PLACED = (gtsam.BearingRangeFactor2D, gtsam.BearingRangeFactor3D)  # one says where its landmark is
 APART = "the landmark belongs to a part of the graph that is not connected yet"
 
+EVERY = slice(None)
+PLANE: Mapping[Form, slice] = {  # axes of a value that a plane has
+    "position": slice(2), "bearing_range": slice(0, 3, 2), "bearing": slice(1), "range": slice(1),
+}  # fmt: skip
 QUATERNION = ("qx", "qy", "qz", "qw")
 NOISY = ("x", "y", "z", "roll", "pitch", "yaw")  # axes of the noise of a pose
 COMMON = dict.fromkeys("xyz", "sigma_position") | dict.fromkeys(NOISY[3:], "sigma_rotation")
@@ -242,7 +246,7 @@ def _level(
     turn = whole.rotation().matrix()
     if not np.isfinite(m.value).all():
         raise Unusable("not_finite", "a tilted sensor needs x, y and z")
-    noise = defaulted(m.covariance, np.eye(3) * config.sigma_position**2)
+    noise = defaulted(m.covariance, (config.sigma_position**2,) * 3)
     upright = replace(m, value=whole.transformFrom(m.value), covariance=turn @ noise @ turn.T)
     return upright, context.space.identity
 
@@ -379,7 +383,7 @@ def moved(point: Array, covariance: Array, mount: Pose, motion: Motion | None) -
 
 def _in_space(m: LandmarkObservation, context: Context, config: LandmarkSource) -> tuple[Array, Array]:
     """The value and covariance without the axes that the space lacks, zeros and NaN replaced by the defaults, ranges to scale."""
-    space, scale = context.space, context.correction.range_scale
+    keep, scale = _axes(m.form, context.space), context.correction.range_scale
     bearing, span = config.sigma_bearing**2, config.sigma_range**2
     defaults = {
         "position": (config.sigma_position**2,) * 3,
@@ -387,23 +391,19 @@ def _in_space(m: LandmarkObservation, context: Context, config: LandmarkSource) 
         "bearing": (bearing, bearing),
         "range": (span,),
     }[m.form]
-    keep = list(used_axes(m.form, len(m.value), space))
-    covariance = defaulted(m.covariance[np.ix_(keep, keep)], np.diag([defaults[k] for k in keep]))
-    value = m.value[keep]
+    value, covariance = m.value[keep], defaulted(m.covariance[keep, keep], defaults[keep])
     if scale != 1 and m.form in ("range", "bearing_range"):
-        value[-1] /= scale
-        covariance[-1] /= scale
-        covariance[:, -1] /= scale
+        shrunk = np.ones(len(value))
+        shrunk[-1] = 1 / scale
+        value, covariance = value * shrunk, covariance * shrunk[:, None] * shrunk
     return value, covariance
 
 
-def vertical(form: Form) -> int | None:
-    """The axis of a value that a plane does not have."""
-    return {"position": 2, "range": None}.get(form, 1)
+def _axes(form: Form, space: Space) -> slice:
+    """Of a value that is no pose, those that the space has."""
+    return EVERY if space.name == "3d" else PLANE[form]
 
 
 def used_axes(form: Form, size: int, space: Space) -> tuple[int, ...]:
     """Which of so many axes of noise the space has."""
-    if form == "pose":
-        return tuple(space.used)
-    return tuple(k for k in range(size) if space.name == "3d" or k != vertical(form))
+    return tuple(space.used) if form == "pose" else tuple(range(size))[_axes(form, space)]

@@ -28,7 +28,7 @@ def tag_from_keyframe(
     which is level on a wall, on the floor and on the ceiling alike.
     """
     (value, noise), space = seen, context.space
-    noise = defaulted(noise, np.diag((config.sigma_position**2,) * 3 + (config.sigma_rotation**2,) * 3))
+    noise = defaulted(noise, (config.sigma_position**2,) * 3 + (config.sigma_rotation**2,) * 3)
     if (whole := tilted(context, frame)) is not None:
         turn = np.kron(np.eye(2), whole.rotation().matrix())
         noise = turn @ noise @ turn.T

@@ -27,7 +27,7 @@ from ..firewall.rules import FARTHEST
 from ..graph import Decision, Delta, Estimate, Factor, Pose, is_pose
 from ..measurement import Array
 from ..space import Space
-from ..variables import estimate_in, largest
+from ..variables import estimate_in, is_posed, largest
 from .salvage import salvaged
 
 SETTLED = 1e-10  # largest change of a variable (m, rad) at which a rebuild is done
@@ -68,6 +68,7 @@ class Isam2:
         if not self.factors.keys() >= set(delta.remove):  # what had to be let go of before is gone already
             delta = replace(delta, remove=tuple(id_ for id_ in delta.remove if id_ in self.factors))
         fresh = [key for key in delta.values if not self._isam.valueExists(key)]
+        self._believed.forget()
         try:
             if len(fresh) < len(delta.values):
                 self._move(delta)  # variables that exist are moved: iSAM2 cannot do that
@@ -75,6 +76,7 @@ class Isam2:
                 self._apply(delta)
             self._check(delta)
         except _Failures as error:
+            self._believed.forget()
             self._recover(delta, fresh, error)
         self._commit(delta)
         return self._believed
@@ -86,6 +88,7 @@ class Isam2:
                 self._isam, self._slots = self._settled(self.factors.values(), values)
             except _Failures as error:
                 self._note("unpolished", error, 0)
+        self._believed.forget()
         return self._believed
 
     def restart(self, factors: Iterable[Factor], values: gtsam.Values) -> Estimate:
@@ -98,6 +101,7 @@ class Isam2:
             self._qr = qr
             raise SolverFailure(_short(error), ()) from None
         self._isam, self._slots = isam, slots
+        self._believed.forget()
         self.factors.clear()  # others hold on to the store itself
         self.factors.update(held)
         return self._believed
@@ -312,18 +316,28 @@ class Believed:
 
     def __init__(self, solver: Isam2) -> None:
         self._solver = solver
+        self._poses: dict[int, Pose] = {}  # asked for since the last update: of the newest several times
+
+    def forget(self) -> None:
+        """The solver believes something else now."""
+        self._poses.clear()
 
     @property
     def _isam(self) -> gtsam.ISAM2:
         return self._solver._isam  # noqa: SLF001  # one thing in two classes
 
     def pose(self, key: int) -> Pose:
-        return self._solver._space.estimate(self._isam, key)  # noqa: SLF001
+        found = self._poses.get(key)
+        if found is None:
+            found = self._poses[key] = self._solver._space.estimate(self._isam, key)  # noqa: SLF001
+        return found
 
     def point(self, key: int) -> Array:
         return self._solver._space.estimate_point(self._isam, key)  # noqa: SLF001
 
     def value(self, key: int) -> Any:
+        if is_posed(key):
+            return self.pose(key)
         return estimate_in(self._solver._space, self._isam, key)  # noqa: SLF001
 
     def knows(self, key: int) -> bool:
