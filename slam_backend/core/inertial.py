@@ -126,7 +126,8 @@ class Inertial:
         self._at = 0  # stamp up to which it goes
         self._flaw = ""
         self._bias = Bias()  # last believed
-        self._slope, self._straight = 0.0, 0  # of the vertical acceleration, per ns; ns
+        self._up, self._slope = 0.0, 0.0  # vertical acceleration of the newest sample; its change per ns
+        self._straight = 0  # ns for which that has been the same
         self._same: int | None = 0  # ns for which nothing has changed; None once that has been told
         self._period = PERIOD  # s between the newest two samples
         self._decisions: list[Decision] = []
@@ -155,15 +156,15 @@ class Inertial:
         """How far apart samples are, and for how long (ns) they have been lying on a straight line that is not level: somebody
         filled a gap with them.
         """
-        elapsed, last = sample.stamp - before.stamp, self._slope
+        elapsed, last, up = sample.stamp - before.stamp, self._slope, sample.acceleration.item(2)
         if 0 < elapsed <= self._longest:
             self._period = elapsed / SECOND
-        rise = sample.acceleration.item(2) - before.acceleration.item(2)
-        self._slope = rise / elapsed if elapsed > 0 else 0.0
-        on = self._slope != 0 and abs(self._slope - last) <= STRAIGHT * abs(self._slope)
+        self._slope = slope = (up - self._up) / elapsed if elapsed > 0 else 0.0
+        self._up = up
+        on = slope != 0 and abs(slope - last) <= STRAIGHT * abs(slope)
         self._straight = self._straight + elapsed if on else 0
         if self._same is not None:
-            stuck = self._slope == 0 and elapsed > 0 and _are_alike(sample, before)
+            stuck = slope == 0 and elapsed > 0 and _are_alike(sample, before)
             self._same = self._same + elapsed if stuck else 0
             if self._same > STUCK:
                 self._decide(sample.stamp, "accepted", "imu/stuck", self._same / SECOND)
