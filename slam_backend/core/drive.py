@@ -80,11 +80,16 @@ class Drive:
         newest, there = books.newest
         moved, elapsed = there.between(track.pose(stamp)), stamp - newest.stamp
         if elapsed > 0 and (restarted or due(self._pace, books.space, moved, elapsed)):
-            at = books.waiting.image(newest.stamp, stamp)
-            if at is not None and track.covers(at):
-                yield at
-            if at is None or (at < stamp and (restarted or books.config.keyframes.every)):
-                yield stamp
+            yield from self._due(newest, stamp, restarted)
+
+    def _due(self, newest: Keyframe, stamp: int, restarted: bool = False) -> Iterator[int]:
+        """A keyframe is due at this stamp: where the newest image was, if there has been one since the newest keyframe."""
+        books = self._books
+        at = books.waiting.image(newest.stamp, stamp)
+        if at is not None and books.track.covers(at):
+            yield at
+        if at is None or (at < stamp and (restarted or books.config.keyframes.every)):
+            yield stamp
 
     def _sample(self, sample: ImuSample, inertial: Inertial) -> Iterable[int]:
         """The IMU says something: kept for the next keyframe; where it drives, the track follows."""
@@ -114,8 +119,11 @@ class Drive:
             if books.newest and wanted > books.newest[0].stamp:
                 yield wanted
         if books.newest and sample.stamp - books.track.newest >= STEP:
-            books.track.add(sample.stamp, books.newest[1].compose(inertial.moved(sample.stamp)))
-            yield from self._reached(sample.stamp)
+            newest, there = books.newest
+            moved = inertial.moved(sample.stamp)
+            books.track.add(sample.stamp, there.compose(moved))
+            if due(self._pace, books.space, moved, sample.stamp - newest.stamp):
+                yield from self._due(newest, sample.stamp)
 
     def coast(self, item: Measurement, coaster: Coaster) -> Iterator[int]:
         """Nothing measures the motion: the track goes on as the positions before this one let expect."""
