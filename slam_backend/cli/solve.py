@@ -102,7 +102,7 @@ def _said(problem: "Problem", found: "Optimum") -> dict[str, Any]:
         "decisions": [
             f"{decision.id}: {decision.detail or decision.reason}" for decision in problem.decisions
         ],
-        "left_out": list(problem.left_out),
+        "left_out": [*problem.left_out, *found.left_out],
         "notes": [*problem.graph.notes, *solution.notes],
         "steps": [{**step._asdict(), "seconds": round(seconds, 4)} for step, seconds in found.steps],
     }

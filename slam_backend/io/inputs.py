@@ -169,8 +169,7 @@ class GraphInput(_Closing):
 
     @property
     def damage(self) -> list[str]:
-        between = len(self.graph.ranges) - int(self.graph.ranges.to_landmark.sum())
-        left = [f"{between} ranges between vertices are left out; `solve` takes them"] if between else []
+        left = [f"left out: {what}; vertex by vertex they have no place" for what in self.graph.timeless]
         return [f"{self.paths[0]}: {note}" for note in (*self.graph.notes, *left)]
 
     def stream(self, config: Config) -> Stream:

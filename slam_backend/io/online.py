@@ -18,7 +18,7 @@ def solve_online(
 ) -> tuple[gtsam.Values, gtsam.Values]:
     """What iSAM2 believes at the end, and the same linearized anew. The first vertex of a part is its origin.
 
-    advance: called with 1 for every vertex. Priors and held vertices of the file are not used.
+    advance: called with 1 for every vertex. What is `timeless` in the graph is not used.
     """
     config = config_of(problem.graph, kernel)
     backend = Backend(config)

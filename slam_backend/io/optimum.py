@@ -41,7 +41,8 @@ class Request:
 class Optimum:
     """start: with why it was chosen, and its cost. steps: each with the seconds it took; seconds: of all of them and of
     the initialization. refused: the loops that GNC took out; the costs of the solution are those of what it kept.
-    cost_initial: of the file's vertices, or of the odometry where it states none.
+    cost_initial: of the file's vertices, or of the odometry where it states none. left_out: what the problem has and the method does
+    not take, in words; it is in the costs.
     """
 
     start: Start
@@ -51,6 +52,7 @@ class Optimum:
     steps: tuple[tuple[Step, float], ...]
     seconds: float
     refused: tuple[Factor, ...] = ()
+    left_out: tuple[str, ...] = ()
 
 
 def optimum(problem: Problem, request: Request, advance: Advance) -> Optimum:
@@ -58,6 +60,7 @@ def optimum(problem: Problem, request: Request, advance: Advance) -> Optimum:
     watch = Watch(advance)
     factors, options = problem.factors, request.options
     refused: tuple[str, ...] = ()
+    left: tuple[str, ...] = ()
     if request.method == "isam2":
         online, relinearized = solve_online(problem, request.kernel, advance)
         start = Start(online, "isam2", "iSAM2's last estimate", cost_of(factors, online))
@@ -65,6 +68,12 @@ def optimum(problem: Problem, request: Request, advance: Advance) -> Optimum:
         solution = replace(solve(factors, relinearized, nothing), stop="every vertex is in")
         if request.polish:
             solution = polish(factors, relinearized, options, watch)
+        else:
+            left = tuple(
+                f"{what} (isam2 goes vertex by vertex; --polish, or another --method, takes them)"
+                for what in problem.graph.timeless
+                if what not in problem.left_out
+            )
     else:
         # wrong loops would lead any start astray that rests on them
         init = "odometry" if request.gnc and request.init == "auto" else request.init
@@ -76,7 +85,7 @@ def optimum(problem: Problem, request: Request, advance: Advance) -> Optimum:
     seconds, gone = watch.elapsed, set(refused)
     removed = tuple(factor for factor in factors if factor.id in gone)
     before = solution.cost_initial if start.cost is None else start.cost
-    return Optimum(start, before, _untouched(problem), solution, tuple(watch.steps), seconds, removed)
+    return Optimum(start, before, _untouched(problem), solution, tuple(watch.steps), seconds, removed, left)
 
 
 def _untouched(problem: Problem) -> float:

@@ -19,6 +19,7 @@ from .state import State
 OK, WARN, ERROR = 0, 1, 2
 LEVELS: Mapping[Severity, int] = {"note": OK, "warn": WARN, "error": ERROR}
 SILENT = 3.0  # s without a message after which a source is silent
+DEAD = 10.0  # s after which the log says of a topic that it was never heard: drivers take as long to start
 FRESH = 10.0  # s for which an incident is the news
 BEHIND = 2000  # rows that the worker has yet to read, beyond which it is behind
 
@@ -35,6 +36,7 @@ class Diagnostics:
             tuple[str, str], tuple[int, float]
         ] = {}  # (source, rule) -> count, when it last grew
         self._warned: set[tuple[str, str]] = set()  # source, rule: what the log has been told of
+        self._begun = monotonic()
         self._publisher = node.create_publisher(DiagnosticArray, "/diagnostics", 10)
 
     def close(self) -> None:
@@ -46,6 +48,8 @@ class Diagnostics:
             _status(f"{name}: {source}", *self._source(source, setting.topic, inputs))
             for source, setting in config.sources.items()
         ]
+        if monotonic() - self._begun > DEAD:
+            self._miss(inputs, config)
         static = inputs.flows.get(self._node.resolve_topic_name(TF_STATIC))
         if static is not None and static.incompatible:
             statuses.append(_status(f"{name}: {TF_STATIC}", ERROR, static.incompatible, {"qos": static.qos}))
@@ -101,6 +105,22 @@ class Diagnostics:
             if rule is not None and rule.severity == "error" and (source, id_) not in self._warned:
                 self._warned.add((source, id_))
                 self._node.get_logger().warning(f"source '{source}': {id_}: {rule.what}; {rule.advice}")
+
+    def _miss(self, inputs: Inputs, config: Config) -> None:
+        """In the log, once: a topic of a source that has never been heard, and why that may be."""
+        for source, setting in config.sources.items():
+            for topic in setting.topics:
+                flow = inputs.flows.get(topic)
+                if (flow is not None and flow.newest) or (source, topic) in self._warned:
+                    continue
+                self._warned.add((source, topic))
+                if topic in inputs.unreadable:
+                    why = f"it has {inputs.unreadable[topic]}, which its kind cannot read"
+                elif flow is None:
+                    why = "it has no publisher; see `ros2 topic list`"
+                else:
+                    why = flow.incompatible or f"{flow.publishers} publish it and send nothing"
+                self._node.get_logger().warning(f"source '{source}': nothing heard yet on {topic}: {why}")
 
     def _verdict(self, source: str, told: Mapping[str, int]) -> tuple[int, str]:
         """By the firewall's table: the worst of what it has said lately, and what to do about it; else whether its noise is true."""

@@ -110,9 +110,27 @@ def test_a_replay_and_isam2_use_them_too(graph, capsys):
     assert sum(f.kind == "landmark" for f in result.factors) == 48
     for name, at in zip(result.snapshot.names, result.snapshot.landmarks, strict=True):
         assert np.linalg.norm(at - beacons[name]) < NEAR
-    assert any("1 ranges between vertices are left out" in line for line in result.summary["damage"])
+    assert any("left out: 1 ranges between vertices" in line for line in result.summary["damage"])
     assert main(["solve", str(path), "--method", "isam2"]) == 0
-    assert "not used" not in capsys.readouterr().out
+    assert "not used: 1 ranges between vertices (isam2 goes" in capsys.readouterr().out
+    for takes_them in (["--method", "isam2", "--polish"], []):
+        assert main(["solve", str(path), *takes_them]) == 0
+        assert "not used" not in capsys.readouterr().out
+
+
+def test_priors_that_a_replay_does_not_take_are_told(tmp_path, capsys):
+    """Of vertices and landmarks; each in one line, with what takes it."""
+    _, _, lines = walk("2d")
+    path = tmp_path / "held.pyfg"
+    priors = ["VERTEX_SE2:PRIOR 0 A0 0 0 0 .01 0 0 .01 0 .01", "VERTEX_XY:PRIOR 0 L1 9 9 .01 0 .01"]
+    path.write_text("\n".join([*lines, *priors]) + "\n")
+    damage = "\n".join(replay(path).result.summary["damage"])
+    assert "left out: 1 priors of vertices" in damage
+    assert "left out: 1 priors of landmarks" in damage
+    assert main(["solve", str(path), "--method", "isam2"]) == 0
+    out = capsys.readouterr().out
+    assert "1 priors of vertices (isam2 goes" in out
+    assert out.count("priors of landmarks") == 1
 
 
 def test_one_range_places_nothing_and_stops_nothing(tmp_path):

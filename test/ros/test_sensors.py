@@ -1,12 +1,21 @@
 """Every kind of sensor through the node, as a user has it: what runs live is what the replay of its journal computes."""
 
+import json
+from pathlib import Path
+
 import pytest
 
 pytest.importorskip("rclpy")
 
 import yaml
+from nav_msgs.srv import LoadMap
+from rcl_interfaces.msg import ParameterType
+from rcl_interfaces.srv import GetParameters
+from std_srvs.srv import Trigger
 
+from slam_backend.core.measurement import format_stamp
 from slam_backend.io.bags import open_bag
+from slam_backend.io.finished import FinishedRun
 from slam_backend.lab.simulate import Options, simulate, write_simulation
 
 FIX, IMU, CLOUD = "sensor_msgs/msg/NavSatFix", "sensor_msgs/msg/Imu", "sensor_msgs/msg/PointCloud2"
@@ -16,6 +25,7 @@ DRIVES = {  # scenario, options, topics that are played (all of them: none named
         "square", Options(poses=200, gnss_every=5, landmarks=0, loop_rate=0.0), ("/fix",),
         {"space": "2d", "sources": ["gps"], "gps": {"kind": "gnss", "topic": "/fix"}},
     ),
+    "fixes": ("square", Options(poses=500, gnss_every=5, landmarks=0, loop_rate=0.0), (), {}),
     "unmounted antenna": (
         "square", Options(poses=100, gnss_every=5, landmarks=0, loop_rate=0.0), ("/odom", "/fix"),
         {"space": "2d", "sources": ["wheels", "gps"], "wheels": {"kind": "odometry", "topic": "/odom"}, "gps": {"kind": "gnss", "topic": "/fix"}},
@@ -107,3 +117,73 @@ def test_a_sensor_that_is_of_no_use_is_said_once_in_the_log(backend, peer, sense
     summary = node.end()
     assert summary["run_hash"] == node.replayed()["run_hash"]
     assert node.process.output.count("[WARN]") == 1
+
+
+def asked(peer, *names):
+    """What ~/query answers, in order: a list of numbers, what a JSON text says, or None."""
+    request = GetParameters.Request(names=list(names))
+    values = peer.call(GetParameters, "/slam_backend/query", request).values
+    read = {ParameterType.PARAMETER_STRING: lambda v: json.loads(v.string_value),
+            ParameterType.PARAMETER_DOUBLE_ARRAY: lambda v: list(v.double_array_value)}  # fmt: skip
+    return [read[v.type](v) if v.type in read else None for v in values]
+
+
+@pytest.mark.slow
+def test_the_earth_is_told_over_the_service_and_joins_the_drives_of_a_saved_map(
+    backend, peer, sensed
+) -> None:
+    """Unknown with the reason at first, then as the run says; a map that is loaded is joined by the fixes of the new drive."""
+    records, config = sensed("fixes")
+    node = backend(config)
+    few, half = 10, len(records) // 2
+    peer.play(records[:few], rate=10)
+    peer.until(lambda: asked(peer, "earth")[0])
+    early, place = asked(peer, "earth", "place@now")
+    assert early["map_T_earth"] is None
+    assert "yaw not yet observable" in early["why"]
+    assert place is None
+    peer.play(records[few:half], rate=10)
+    peer.until(lambda: asked(peer, "earth")[0]["map_T_earth"])
+    saved = json.loads(peer.call(Trigger, "/slam_backend/save").message)
+    run = Path(saved["run"])
+    known, place, then = asked(peer, "earth", "place@now", f"map@{records_end(run)}/earth")
+    finished = FinishedRun(run)
+    assert known["origin"] == finished.summary["earth"]["origin"] == then["origin"]
+    assert known["map_T_earth"] == pytest.approx(finished.summary["earth"]["map_T_earth"], abs=1e-3)
+    assert place[:2] == pytest.approx(known["origin"][:2], abs=1e-2)  # degrees: the drive is small
+    answer = peer.call(LoadMap, "/slam_backend/load", LoadMap.Request(map_url=f"runs/{run.name}"))
+    assert answer.result == LoadMap.Response.RESULT_SUCCESS
+    peer.play(records[half:], rate=10)
+    summary = node.end()
+    assert summary["counts"]["parts"] == 1
+    assert summary["decisions"]["gnss/joined"] == 1
+    assert len(summary["sessions"]) == 2
+    assert summary["earth"]["origin"] == known["origin"]
+    assert summary["run_hash"] == node.replayed()["run_hash"]
+
+
+def records_end(run):
+    """Where a run ends, as a stamp in words."""
+    return format_stamp(int(FinishedRun(run).trajectory.stamps[-1]))
+
+
+@pytest.mark.slow
+def test_a_topic_that_is_never_heard_is_said_once_in_the_log(backend, peer, sensed) -> None:
+    """One that nobody publishes, and one that is published and stays silent; not one that was heard once."""
+    records, config = sensed("unmounted antenna")
+    given = yaml.safe_load(config.read_text())
+    config.write_text(
+        yaml.safe_dump(
+            given | {"sources": ["wheels", "gps", "tags"], "tags": {"kind": "landmark", "topic": "/tags"}}
+        )
+    )
+    node = backend(config)
+    dumb = peer.publisher("/tags", CLOUD)
+    peer.play([record for record in records if record.topic == "/odom"], rate=10)
+    told = node.process.wait_for("source 'gps'") + node.process.wait_for("source 'tags'")
+    peer.spin(2)
+    node.end()
+    assert "source 'gps': nothing heard yet on /fix: it has no publisher" in told
+    assert "source 'tags': nothing heard yet on /tags: 1 publish it and send nothing" in told
+    assert node.process.output.count("[WARN]") == 2
+    peer.node.destroy_publisher(dumb)

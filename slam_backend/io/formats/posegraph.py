@@ -122,6 +122,17 @@ class PoseGraph:
         """Whether a sighting or a range leads to one."""
         return len(self.sightings) > 0 or bool(self.ranges.to_landmark.any())
 
+    @property
+    def timeless(self) -> list[str]:
+        """What is not among its `measurements`, in words: it comes with no vertex, or the first one is held instead of it."""
+        counts = {
+            "ranges between vertices": len(self.ranges) - int(self.ranges.to_landmark.sum()),
+            "priors of vertices": len(self.priors),
+            "fixed vertices": int(np.count_nonzero(self.fixed)),  # the first is held anyway
+            "priors of landmarks": len(self.landmark_priors),
+        }
+        return [f"{count} {what}" for what, count in counts.items() if count]
+
     def stamps_at(self, period: int = PERIOD) -> Stamps:
         """(N,) ns: the rank of each vertex times `period`, counted from one."""
         return (np.arange(len(self.ids), dtype=np.int64) + 1) * period
