@@ -1,7 +1,7 @@
 """Names for sightings that come without: which landmark each is of, and when one is new."""
 
 from collections import defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 
@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 
 from ..config import LandmarkSource
 from ..context import Context, Unusable
-from ..errors import SolverFailure
 from ..graph import Decision, Keyframe, Motion, Offer, Pose, Verdict
 from ..measurement import SECOND, Array
 from ..robust.chi2 import chi2_quantile
@@ -19,6 +18,7 @@ from ..sensors.ranging import PLACELESS
 from ..space import Space
 from .compatibility import Pairs, Prediction, jointly, nearest
 from .consensus import consensus
+from .prediction import predicted
 
 Numbers = NDArray[np.intp]
 
@@ -200,7 +200,8 @@ class Associator:
         most = max(MOST_CANDIDATES, *(len(scan.sightings) for scan in scans))
         rows = np.sort(rows[order][:most])
         candidates = near[rows]
-        points, covariance = self._predicted(pose, keyframe, candidates, a, context)
+        keys = [self._keys[n] for n in candidates.tolist()]
+        points, covariance = predicted(keyframe, keys, self._points[candidates], a, context)
         return Region(near, candidates, points, covariance)
 
     def _plausible(self, gaps: Array, scans: Sequence[Scan]) -> NDArray[np.bool_]:
@@ -238,46 +239,6 @@ class Associator:
             return nearest(distances, limit), distances
         return jointly(prediction, distances, self._config.gate), distances
 
-    def _predicted(
-        self, pose: Pose, keyframe: Keyframe, which: Numbers, a: Keyframe | None, context: Context
-    ) -> tuple[Array, Array]:
-        """Where these landmarks should be seen from a keyframe, and the joint covariance of that."""
-        d, size = self._space.point_dimension, self._space.dimension
-        points, to_pose = np.zeros((len(which), d)), np.zeros((len(which) * d, size))
-        to_point = np.zeros((len(which) * d, len(which) * d))
-        of_pose, of_point = np.zeros((d, size), order="F"), np.zeros((d, d), order="F")
-        for k, n in enumerate(which.tolist()):
-            points[k] = pose.transformTo(self._points[n], of_pose, of_point)
-            rows = slice(k * d, k * d + d)
-            to_pose[rows], to_point[rows, rows] = of_pose, of_point
-        if not len(which):
-            return points, np.zeros((0, 0))
-        jacobian = np.hstack([to_pose, to_point])
-        joint = self._joint(keyframe, [self._keys[n] for n in which.tolist()], a, context)
-        return points, jacobian @ joint @ jacobian.T
-
-    def _joint(self, keyframe: Keyframe, keys: Sequence[int], a: Keyframe | None, context: Context) -> Array:
-        """Of the keyframe's pose and landmarks. A keyframe that the solver does not know yet is as sure as the one before it and
-        the odometry since.
-        """
-        estimate, size = context.estimate, self._space.dimension
-        total = size + len(keys) * self._space.point_dimension
-        if estimate is None:
-            return np.zeros((total, total))
-        known = estimate.knows(keyframe.pose)
-        origin = keyframe if known or a is None else a
-        try:
-            joint = np.array(estimate.covariance([origin.pose, *keys]))
-        except SolverFailure:
-            joint = np.zeros((total, total))  # then the sighting's own noise is all there is
-        if not known and a is not None:
-            motion = context.motion(a.stamp, keyframe.stamp)
-            carry = np.eye(total)
-            carry[:size, :size] = motion.pose.inverse().AdjointMap()
-            joint = carry @ joint @ carry.T
-            joint[:size, :size] += motion.covariance
-        return joint
-
     def _agreed(self, scan: Scan, region: "Region") -> Pairs | None:
         """Pairs by consensus, where the prediction is too far off for the gate."""
         if self._config.search == 0:
@@ -312,17 +273,17 @@ class Associator:
             return
         ready = tentative.sightings[-1:]
         if not tentative.name:
-            tentative.name, ready = self._begun(context), tentative.sightings
+            tentative.name, ready = self.begin(context.landmark), tentative.sightings
         for each in ready:
             named.append(_as(each.offer, tentative.name))
             decisions.append(self._told(each.offer, "accepted", "new", f"of {tentative.name}, which is new"))
 
-    def _begun(self, context: Context) -> str:
-        """The name of a new landmark, which will be in the graph at the end of this window."""
+    def begin(self, landmark: Callable[[str], int]) -> str:
+        """The name of a new landmark, which will be in the graph soon. landmark: name -> key."""
         name = f"{self._source}:{self._made}"
         self._made += 1
         self._names.append(name)
-        self._keys.append(key := context.landmark(name))
+        self._keys.append(key := landmark(name))
         self._by_key[key] = name
         self._points = np.vstack([self._points, np.full(self._space.point_dimension, np.inf)])
         self._age = REFRESHED
