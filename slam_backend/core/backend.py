@@ -26,7 +26,6 @@ from .graph import Delta, Estimate, Factor, Offer
 from .growth import Growth
 from .keyframes import Track
 from .measurement import Array, Constant, Measurement, StaticTransform
-from .quarantine import Quarantine
 from .reading import Reading
 from .robust import Robust
 from .sensing import Sensing
@@ -37,6 +36,7 @@ from .sessions import SavedMap, fits
 from .settle import FAR
 from .solvers import SOLVERS, Solver
 from .space import SPACES
+from .splitting import twins_of
 from .trajectory import Snapshot, Trajectory
 
 __all__ = ["SOURCES", "Backend", "Update"]
@@ -71,10 +71,9 @@ class Backend:
         self.calibration, self.landmark = books.calibration, books.landmark
         self._applier, self._waiting = books.applier, books.waiting
         self._growth = Growth(space, books.timeline, books.track, books.parts)
-        quarantine = Quarantine(config, space, solver.factors)
-        self._sensing = Sensing(books, quarantine)
+        self._sensing = Sensing(books)
         self._drive = Drive(books, self._sensing, self._growth)
-        self._change = Change(books, self._drive, self._sensing, quarantine, robust)
+        self._change = Change(books, self._drive, self._sensing, robust)
         self._reading, self.jury, self._paths = Reading(books), self._change.jury, self._change.paths
         self._by_edges = config.sources[books.driver].kind == "relative"
         self._is_complete = False  # nothing was offered since the last keyframes along edges were made
@@ -89,6 +88,7 @@ class Backend:
         for each in saved.keyframes:
             books.timeline.add(each)
         books.landmarks |= saved.landmarks
+        books.twins |= twins_of(saved.landmarks, saved.factors)
         self._sensing.restore(saved.landmarks)
         noise = books.track.noise
         books.tracks.before([Track(self.space, noise).restore(each) for each in saved.tracks])

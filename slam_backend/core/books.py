@@ -3,6 +3,7 @@ what reads (`reading.py`).
 """
 
 from collections.abc import Sequence
+from typing import Literal, NamedTuple
 
 from .apply import Applier
 from .calibration import Calibration
@@ -21,12 +22,23 @@ from .solvers import Solver
 from .space import SPACES
 from .waiting import Waiting
 
+Reason = Literal["moved", "duplicate", "moving"]  # why a landmark is in quarantine
+
+SECOND_PLACE = "~2"  # after the id of a landmark that is at two places, of the one that was seen later
+
+
+class Twins(NamedTuple):
+    """Of an id that is at two places: the landmarks there. since: the stamp from which on it is at the second; None where both are there."""
+
+    names: tuple[str, str]
+    since: int | None
+
 
 class Books:
     """driver, imu: names of the source that drives the keyframes, and of the IMU; of the latter empty where there is none.
 
     origin: of east, north, up: latitude, longitude, altitude; None before the first fix. landmarks: name -> key. became: key of one that was found
-    to be another -> that of the other.
+    to be another -> that of the other. twins: ids that are at two places. suspended: landmarks in quarantine, by key.
     newest: the newest keyframe, and its pose by the odometry. stretch: what the IMU measured up to the keyframe that is being made.
     decisions: told with the next update.
     """
@@ -48,6 +60,8 @@ class Books:
         self.origin: Sequence[float] | None = config.earth.origin
         self.landmarks: dict[str, int] = {}
         self.became: dict[int, int] = {}
+        self.twins: dict[str, Twins] = {}
+        self.suspended: dict[int, Reason] = {}
         self.waiting, self.calibration = Waiting(config), Calibration(config, self.space)
         self.waiting.late = self.calibration.late
         self.applier = Applier(solver, self.space, self.parts, self.waiting.wake)

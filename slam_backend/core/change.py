@@ -26,6 +26,7 @@ from .robust import ROBUST, Doubt, Robust
 from .robust.paths import Paths
 from .sensing import Sensing
 from .sensors.odometry import HERE
+from .splitting import Splitter
 from .variables import value_in
 
 
@@ -56,7 +57,6 @@ class Change:
         books: Books,
         drive: Drive,
         sensing: Sensing,
-        quarantine: Quarantine,
         robust: Sequence[Robust] | None,
     ) -> None:
         """robust: instead of the stages that the configuration names."""
@@ -64,15 +64,16 @@ class Change:
         self._books, self._drive, self._sensing = books, drive, sensing
         self._space, self._floor = books.space, floor_from(config)
         self.paths = Paths(books.space, config.gate.odometry_scale, solver.factors)
-        self._quarantine = quarantine
+        self._splitter = Splitter(books, sensing.associators, lambda: self.editor.edited_variables)
+        self._quarantine = Quarantine(books, self._splitter, self.paths)
         self._budget = Budget(config, books.space, solver.factors, lambda: self.editor.wishes.ids)
         self._merger = Merger(
             books,
             sensing.associators,
             self.paths,
-            lambda: self.editor.edited_variables | quarantine.suspected,
+            lambda: self.editor.edited_variables | books.suspended.keys(),
         )
-        usual = _stages(config, self.paths, quarantine, self._merger, self._budget)
+        usual = _stages(config, self.paths, self._quarantine, self._merger, self._budget)
         stages = usual if robust is None else robust
         self._is_judged = bool(stages)
         books.applier.booked = self._book
@@ -114,6 +115,7 @@ class Change:
             self._budget.book(delta)
             self._merger.book(delta)
             self._books.decisions += self._merger.take_decisions()
+            self._books.decisions += self._splitter.book(delta)
         if delta.remove:
             for key in self._quarantine.left(self._books.estimate.knows):
                 self._books.parts.drop(key)

@@ -3,9 +3,11 @@
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from math import sqrt
+from typing import Any
 
 import gtsam
 import numpy as np
+from numpy.typing import NDArray
 
 from .graph import Estimate, Factor
 from .measurement import Array
@@ -24,14 +26,58 @@ class Places:
     sigma: float
 
 
-def place_of(factor: Factor, estimate: Estimate) -> Array:
-    """In the map, from the pose of the sighting as it is believed now."""
+@dataclass(frozen=True, slots=True, eq=False)
+class Parted:
+    """Sightings of one landmark that lie at two places. first: (N,) which of them are at the place that was seen first.
+
+    apart: m between the two; spreads: m of either around its median; limit: m that noise explains. since: the stamp from which on all
+    are at the second place; None where they are seen in turn.
+    """
+
+    places: Places
+    first: NDArray[np.bool_]
+    apart: float
+    limit: float
+    since: int | None
+
+    @property
+    def fewest(self) -> int:
+        """Sightings at the place that has fewer of them."""
+        return int(min(self.first.sum(), (~self.first).sum()))
+
+    @property
+    def spreads(self) -> tuple[float, float]:
+        points = self.places.points
+        return spread(points[self.first]), spread(points[~self.first])
+
+
+def seen_at(factor: Factor) -> Array:
+    """The point that a sighting states, in the frame of its pose."""
     seen = factor.factor.measured()
     if isinstance(factor.factor, TAGS):
-        return np.asarray(estimate.pose(factor.keys[0]).transformFrom(seen.translation()))
+        return np.asarray(seen.translation())
     direction = seen.bearing()
     ahead = direction.point3() if hasattr(direction, "point3") else np.array([direction.c(), direction.s()])
-    return np.asarray(estimate.pose(factor.keys[0]).transformFrom(ahead * seen.range()))
+    return np.asarray(ahead * seen.range())
+
+
+def place_of(factor: Factor, estimate: Estimate) -> Array:
+    """In the map, from the pose of the sighting as it is believed now."""
+    return np.asarray(estimate.pose(factor.keys[0]).transformFrom(seen_at(factor)))
+
+
+def misfit(factor: Factor, landmark: Any, estimate: Estimate, space: Space) -> float:
+    """Chi-square of a sighting, if its landmark is there; of a tag that of its position alone."""
+    values = gtsam.Values()
+    values.insert(factor.keys[0], estimate.value(factor.keys[0]))
+    values.insert(factor.keys[1], landmark)
+    noise: Any = without_kernel(factor.factor.noiseModel())
+    if isinstance(factor.factor, TAGS):
+        place = space.translation
+        off = factor.factor.unwhitenedError(values)[place]
+        return float(off @ np.linalg.solve(noise.covariance()[place, place], off))
+    white = noise.whiten(factor.factor.unwhitenedError(values))
+    return float(white @ white)
 
 
 def sigma_of(factor: Factor, space: Space) -> float:
@@ -55,6 +101,18 @@ def apart_by(one: Array, other: Array, limit: float) -> float:
     return apart if max(spread(one), spread(other)) <= min(limit, apart / 4) else 0.0
 
 
+def parted(places: Places, limit: float) -> Parted | None:
+    """The two places at which sightings lie, one after the other or in turn; None if they do not. limit: m that noise explains."""
+    points = places.points
+    then = parted_in_time(points)
+    if then is not None and (apart := apart_by(points[:then], points[then:], limit)):
+        return Parted(places, np.arange(len(points)) < then, apart, limit, places.factors[then].stamp)
+    one = halves(points)
+    if apart := apart_by(points[one], points[~one], limit):
+        return Parted(places, one if one[0] else ~one, apart, limit, None)
+    return None
+
+
 def parted_in_time(points: Array) -> int | None:
     """Where a sequence is best cut into two, each around its own place; None if it is too short for that."""
     cuts: Iterable[int] = range(2, len(points) - 1)
@@ -66,7 +124,7 @@ def _scatter(points: Array) -> float:
     return float(np.linalg.norm(points - np.median(points, axis=0), axis=1).sum())
 
 
-def halves(points: Array) -> np.ndarray:
+def halves(points: Array) -> NDArray[np.bool_]:
     """(N,) which of two clusters: k-means (Lloyd, 1982) from the two points that lie farthest apart."""
     gaps = np.linalg.norm(points[:, None] - points[None], axis=2)
     a, b = np.unravel_index(int(np.argmax(gaps)), gaps.shape)

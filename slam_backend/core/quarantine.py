@@ -9,21 +9,19 @@ done), at two, one after the other (it was moved), at two in turn (there are two
 from collections import defaultdict, deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Literal
 
 import gtsam
 import numpy as np
 
-from .config import Config
+from .books import Books, Reason
 from .graph import Decision, Delta, Estimate, Factor, Offer
-from .places import TAGS, Places, apart_by, halves, parted_in_time, place_of, sigma_of, spread
+from .places import TAGS, Parted, Places, misfit, parted, place_of, sigma_of, spread
 from .robust.chi2 import chi2_quantile
-from .robust.kernels import without_kernel
+from .robust.paths import Paths
 from .robust.stage import Judged
 from .sensors.landmark import PLACED
-from .space import Space
-
-Reason = Literal["moved", "duplicate", "moving"]
+from .splitting import Splitter
+from .witnesses import are_two
 
 REMEMBERED = 30  # sightings of a landmark that are looked at
 USUAL = 300  # residuals, of all landmarks, that say what is usual
@@ -38,18 +36,29 @@ class History:
     strange: deque[bool] = field(default_factory=lambda: deque(maxlen=REMEMBERED))
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Found:
+    """Of a landmark that does not stand still. two: the places at which it is. apart: m between them, or around which it moves; limit: m that noise
+    explains.
+    """
+
+    reason: Reason
+    two: Parted | None
+    apart: float
+    limit: float
+
+
 class Quarantine:
     """A robust stage that judges nothing on its way in, and reviews landmarks."""
 
     kinds: frozenset[str] = frozenset()
 
-    def __init__(self, config: Config, space: Space, factors: Mapping[str, Factor]) -> None:
-        """factors: all that are in the graph, by their ids."""
-        self._config, self._space, self._factors = config.quarantine, space, factors
+    def __init__(self, books: Books, splitter: Splitter, paths: Paths) -> None:
+        self._config, self._space, self._factors = books.config.quarantine, books.space, books.solver.factors
+        self._out, self._splitter, self._paths = books.suspended, splitter, paths
         self._histories: dict[int, History] = defaultdict(History)
         self._fresh: list[Factor] = []
         self._residuals: deque[float] = deque(maxlen=USUAL)
-        self._out: dict[int, Reason] = {}
         self._leaving: list[int] = []  # what may have lost its last sighting
 
     def admit(self, proposed: Delta, estimate: Estimate) -> Judged:  # noqa: ARG002  # of no kind of factor
@@ -61,53 +70,42 @@ class Quarantine:
             f for f in delta.add if f.kind == "landmark" and isinstance(f.factor, (*PLACED, *TAGS))
         ]
 
-    def let_in(
-        self, offers: Sequence[Offer], key_of: Mapping[str, int]
-    ) -> tuple[list[Offer], list[Decision]]:
-        """Without sightings of what is in quarantine. key_of: name of a landmark -> its key."""
-        if not self._out:
-            return list(offers), []
-        inside, decisions = [], []
-        for offer in offers:
-            m = offer.measurement
-            name = getattr(m, "landmark", "")
-            reason = self._out.get(key_of.get(name, 0))
-            if reason is None:
-                inside.append(offer)
-            else:
-                why = f"landmark {name} is in quarantine: {reason}"
-                decisions.append(
-                    Decision(m.stamp, offer.id, m.source, "refused", "landmark", "quarantined", why)
-                )
-        return inside, decisions
-
     def review(self, estimate: Estimate) -> Judged:
-        fresh = [factor for factor in self._fresh if factor.id in self._factors]
+        fresh = [factor for factor in self._fresh if self._factors.get(factor.id) is factor]
         self._fresh = []
-        suspects = self._noted(fresh, estimate)
-        remove: list[str] = []
+        amendment = Delta()
         decisions: list[Decision] = []
-        for key in suspects:
-            if (verdict := self._verdict(key, estimate)) is None:
+        suspects = self._noted(fresh, estimate)
+        accused = self._splitter.accused(self._config.sightings)
+        ripe = [key for key in accused if len(self._histories[key].ids) >= 2 * self._config.split]
+        for key in dict.fromkeys((*suspects, *ripe)):
+            if (found := self._verdict(key, estimate)) is None:
                 continue
-            reason, gone, statistic, threshold = verdict
-            self._out[key] = reason
-            self._leaving.append(key)
-            del self._histories[key]
-            remove += [factor.id for factor in gone]
-            decisions += [
-                Decision(
-                    f.stamp, f.id, f.source, "removed", "quarantine", reason, WHY[reason], statistic, threshold,
-                    basis={"landmark": gtsam.DefaultKeyFormatter(key), "removed": len(gone)},
-                )
-                for f in gone
-            ]  # fmt: skip
-        return Delta(remove=tuple(remove)), tuple(decisions)
+            sightings = [f for f in self._factors.values() if f.kind == "landmark" and f.keys[1] == key]
+            change = self._splitter.split(key, found.two, sightings, estimate) if found.two else None
+            if change is None and key in suspects:  # who is only accused by what is beside it stays
+                change, told = self._taken_out(key, found, sightings)
+                decisions += told
+            if change is not None:
+                del self._histories[key]
+                amendment += change
+        return amendment, tuple(decisions)
 
-    @property
-    def suspected(self) -> set[int]:
-        """Landmarks that are in quarantine."""
-        return set(self._out)
+    def _taken_out(
+        self, key: int, found: "Found", sightings: Sequence[Factor]
+    ) -> tuple[Delta, list[Decision]]:
+        since = found.two.since if found.two else None
+        gone = [f for f in sightings if since is None or f.stamp >= since]
+        self._out[key] = found.reason
+        self._leaving.append(key)
+        basis = {"landmark": gtsam.DefaultKeyFormatter(key), "removed": len(gone)}
+        why = WHY[found.reason]
+        return Delta(remove=tuple(f.id for f in gone)), [
+            Decision(
+                f.stamp, f.id, f.source, "removed", "quarantine", found.reason, why, found.apart, found.limit, basis=basis
+            )
+            for f in gone
+        ]  # fmt: skip
 
     def left(self, known: Callable[[int], bool]) -> list[int]:
         """Those that have left the graph with their last sighting, each told once. known: whether the solver still has one."""
@@ -151,44 +149,60 @@ class Quarantine:
         return max(1.0, float(np.median(self._residuals)) / usual)
 
     def _residual(self, factor: Factor, estimate: Estimate) -> float:
-        """Chi-square; of a tag that of its position alone."""
-        values = gtsam.Values()
-        for key in factor.keys:
-            values.insert(key, estimate.value(key))
-        noise: Any = without_kernel(factor.factor.noiseModel())
-        if isinstance(factor.factor, TAGS):
-            place = self._space.translation
-            off = factor.factor.unwhitenedError(values)[place]
-            return float(off @ np.linalg.solve(noise.covariance()[place, place], off))
-        white = noise.whiten(factor.factor.unwhitenedError(values))
-        return float(white @ white)
+        return misfit(factor, estimate.value(factor.keys[1]), estimate, self._space)
 
     # -- places ----------------------------------------------------------------------------------
 
-    def _verdict(self, key: int, estimate: Estimate) -> tuple[Reason, Sequence[Factor], float, float] | None:
-        """Why it is no landmark, which sightings go, how far apart its places are (m), and how far they may be."""
+    def _verdict(self, key: int, estimate: Estimate) -> "Found | None":
+        """Why it is no landmark; None where it is one after all, or where that cannot be told."""
         history = self._histories[key]
         factors = [self._factors[id_] for id_ in history.ids if id_ in self._factors]
+        factors = [factor for factor in factors if factor.keys[1] == key]
+        if not factors:
+            return None
         factors.sort(key=lambda factor: factor.stamp)
         places = self._places(factors, estimate)
         limit = TIGHT * places.sigma
-        if spread(places.points) <= limit:
-            history.strange.clear()  # one place after all: the noise is larger than it says
+        two = parted(places, limit)
+        if spread(places.points) <= limit or (two and not self._are_two(two, estimate)):
+            history.strange.clear()  # the noise is larger than it says, or the pose was off
             return None
-        every = [f for f in self._factors.values() if f.kind == "landmark" and f.keys[1] == key]
-        then = parted_in_time(places.points)
-        if then is not None and (apart := apart_by(places.points[:then], places.points[then:], limit)):
-            since = places.factors[then].stamp
-            return "moved", [f for f in every if f.stamp >= since], apart, limit
-        one = halves(places.points)
-        if apart := apart_by(places.points[one], places.points[~one], limit):
-            return "duplicate", every, apart, limit
-        return "moving", every, spread(places.points), limit
+        if two and len(history.ids) < REMEMBERED and two.fewest < self._config.split:
+            return None  # soon there may be enough at either place
+        if two is None:
+            return Found("moving", None, spread(places.points), limit)
+        return Found("duplicate" if two.since is None else "moved", two, two.apart, limit)
+
+    def _are_two(self, two: Parted, estimate: Estimate) -> bool:
+        def fits(factor: Factor) -> bool:
+            return self._residual(factor, estimate) <= limit
+
+        limit = self._limit()
+        return are_two(two, self._paths, self._factors.values(), fits)
 
     def _places(self, factors: Sequence[Factor], estimate: Estimate) -> Places:
         points = np.array([place_of(factor, estimate) for factor in factors])
         sigmas = [sigma_of(factor, self._space) for factor in factors]
         return Places(factors, points, float(np.median(sigmas) * np.sqrt(self._excess())))
+
+
+def let_in(
+    offers: Sequence[Offer], key_of: Mapping[str, int], out: Mapping[int, Reason]
+) -> tuple[list[Offer], list[Decision]]:
+    """Without sightings of what is in quarantine. key_of: name of a landmark -> its key."""
+    if not out:
+        return list(offers), []
+    inside, decisions = [], []
+    for offer in offers:
+        m = offer.measurement
+        name = getattr(m, "landmark", "")
+        reason = out.get(key_of.get(name, 0))
+        if reason is None:
+            inside.append(offer)
+        else:
+            why = f"landmark {name} is in quarantine: {reason}"
+            decisions.append(Decision(m.stamp, offer.id, m.source, "refused", "landmark", "quarantined", why))
+    return inside, decisions
 
 
 WHY: Mapping[Reason, str] = {

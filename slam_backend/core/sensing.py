@@ -12,17 +12,18 @@ from .books import Books
 from .coast import NAME, coasts
 from .config import LandmarkSource
 from .context import Context
-from .graph import DATUM, Delta, Factor, Keyframe, Offer, total
+from .graph import DATUM, Delta, Factor, Keyframe, Offer, rekeyed, total
 from .measurement import Array, Measurement
-from .quarantine import Quarantine
+from .quarantine import let_in
 from .reunion import Reunion
 from .sensors import SENSORS
 from .sensors.camera import CameraModel
+from .splitting import at_their_places
 
 
 class Sensing:
-    def __init__(self, books: Books, quarantine: Quarantine) -> None:
-        self._books, self._quarantine = books, quarantine
+    def __init__(self, books: Books) -> None:
+        self._books = books
         self._coasts = coasts(books.config)
         self._cameras: dict[str, CameraModel] = {}
         self._memory: dict[str, Any] = {}  # of sensors, by source
@@ -87,10 +88,11 @@ class Sensing:
         for name, source in books.config.sources.items():
             if name in by_source:
                 context, offers = books.calibration.context(self.context(guesses), name), by_source[name]
-                if associator := self.associators.get(name):
-                    offers, decisions = associator.named(offers, a, b, context)
-                    offers, refused = self._quarantine.let_in(offers, books.landmarks)
-                    books.decisions += decisions + refused
+                if isinstance(source, LandmarkSource):
+                    offers, decisions = self.associators[name].named(offers, a, b, context)
+                    offers, told = at_their_places(offers, a, context, source, books)
+                    offers, refused = let_in(offers, books.landmarks, books.suspended)
+                    books.decisions += decisions + told + refused
                 books.calibration.keep(offers)
                 deltas.append(SENSORS[source.kind].factors(offers, a, b, context, source))
                 guesses = {**guesses, **deltas[-1].values}  # what one has found is there for the next
@@ -110,7 +112,7 @@ class Sensing:
                 landed = [offer for offer in books.calibration.offers(name) if offer.id in kept]
                 deltas = [make(landed, None, last, context, settings)]
             made = (factor for delta in deltas for factor in delta.add)
-            found |= {factor.id: factor for factor in made if factor.id in kept}
+            found |= {f.id: _of_the_same(f, kept[f.id]) for f in made if f.id in kept}
         return found
 
     def _steps(self, name: str) -> Iterator[tuple[Offer, Keyframe, Keyframe]]:
@@ -140,6 +142,13 @@ class Sensing:
             source.kind == "pose" for source in books.config.sources.values()
         )
         return None if others or part is None or not books.parts.is_loose(part) else books.parts.gauge(part)
+
+
+def _of_the_same(made: Factor, kept: Factor) -> Factor:
+    """A sighting that has become one of another landmark than its message names stays with that."""
+    if made.kind != "landmark" or made.keys[1] == kept.keys[1]:
+        return made
+    return rekeyed(made, made.keys[1], kept.keys[1])
 
 
 def _by_source(offers: Sequence[Offer]) -> dict[str, list[Offer]]:

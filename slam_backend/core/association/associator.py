@@ -105,6 +105,7 @@ class Associator:
         self._age = 0
         self._made = 0
         self._tentative: list[Tentative] = []
+        self._accused: dict[int, float] = defaultdict(float)
 
     def restore(self, landmarks: Mapping[str, int]) -> None:
         """Go on with those of a saved map. landmarks: name -> key."""
@@ -118,6 +119,15 @@ class Associator:
     def name_of(self, key: int) -> str | None:
         """Of a landmark that it has named; None of any other."""
         return self._by_key.get(key)
+
+    def accused(self, often: int) -> list[int]:
+        """Landmarks that may be two, by their keys, each told once: so many sightings were too close to be of anything else, and not of
+        it, or something new began beside it.
+        """
+        found = [key for key, count in self._accused.items() if count >= often]
+        for key in found:
+            del self._accused[key]
+        return found
 
     def named(
         self, offers: Sequence[Offer], a: Keyframe | None, b: Keyframe, context: Context
@@ -179,13 +189,17 @@ class Associator:
             if n in pairs:
                 name = names[pairs[n]]
                 statistic = float(distances[n, pairs[n]]) if reason == "matched" else None
-                named.append(_as(offer, name))
+                named.append(renamed(offer, name))
                 decisions.append(told(offer, "accepted", reason, f"of {name}", statistic))
             elif reason == "matched" and closest <= strange:
                 why = "too close to a landmark to be new, and not of it"
                 decisions.append(told(offer, "refused", "ambiguous", why, closest))
-            else:
-                self._wait(scan, sighting, tentative, context, named, decisions)
+                self._accused[self._closest(region, distances[n])] += 1
+            elif self._wait(scan, sighting, tentative, context, named, decisions) and closest < np.inf:
+                self._accused[self._closest(region, distances[n])] = np.inf
+
+    def _closest(self, region: "Region", distances: Array) -> int:
+        return self._keys[int(region.candidates[distances.argmin()])]
 
     # -- landmarks that exist --------------------------------------------------------------------
 
@@ -261,8 +275,8 @@ class Associator:
     def _wait(
         self, scan: Scan, sighting: Sighting, places: Array, context: Context,
         named: list[Offer], decisions: list[Decision],
-    ) -> None:  # fmt: skip
-        """One more sighting of something new; enough of them make a landmark. places: of what is tentative already."""
+    ) -> bool:  # fmt: skip
+        """One more sighting of something new; enough of them make a landmark: whether they do. places: of what is tentative already."""
         tentative = self._fitting(scan, sighting, places, context)
         if tentative is None:
             self._tentative.append(Tentative(scan.keyframe.pose, scan.keyframe.stamp, [sighting]))
@@ -270,13 +284,14 @@ class Associator:
         else:
             tentative.sightings.append(sighting)
         if len(tentative.sightings) < self._config.confirmations:
-            return
-        ready = tentative.sightings[-1:]
-        if not tentative.name:
+            return False
+        ready, begins = tentative.sightings[-1:], not tentative.name
+        if begins:
             tentative.name, ready = self.begin(context.landmark), tentative.sightings
         for each in ready:
-            named.append(_as(each.offer, tentative.name))
+            named.append(renamed(each.offer, tentative.name))
             decisions.append(self._told(each.offer, "accepted", "new", f"of {tentative.name}, which is new"))
+        return begins
 
     def begin(self, landmark: Callable[[str], int]) -> str:
         """The name of a new landmark, which will be in the graph soon. landmark: name -> key."""
@@ -331,6 +346,6 @@ class Associator:
         )  # fmt: skip
 
 
-def _as(offer: Offer, name: str) -> Offer:
+def renamed(offer: Offer, name: str) -> Offer:
     assert isinstance(offer.measurement, LandmarkObservation)
     return offer._replace(measurement=replace(offer.measurement, landmark=name))

@@ -43,7 +43,9 @@ def _width(key: int, space: Space) -> int:
     return space.dimension if is_posed(key) else space.point_dimension
 
 
-def _joint(keyframe: Keyframe, keys: Sequence[int], total: int, a: Keyframe | None, context: Context) -> Array:
+def _joint(
+    keyframe: Keyframe, keys: Sequence[int], total: int, a: Keyframe | None, context: Context
+) -> Array:
     """Of the keyframe's pose and landmarks. A keyframe that the solver does not know yet is as sure as the one before it and
     the odometry since.
     """

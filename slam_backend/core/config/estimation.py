@@ -89,7 +89,7 @@ class Coast(Section):
 
 
 class Quarantine(Section):
-    """Landmarks that moved, move, or exist twice are taken out, by the history of their residuals."""
+    """Landmarks that moved or exist twice become two, and those that move are taken out, by the history of their residuals."""
 
     sightings: int = Field(
         5,
@@ -102,6 +102,12 @@ class Quarantine(Section):
         gt=0,
         lt=1,
         description="with which a sighting fits, if noise is as stated (or as usual, if that is more)",
+    )
+    split: int = Field(
+        5,
+        ge=0,
+        le=1000,
+        description="sightings that each of two places must have for a landmark to become two; with fewer it is taken out; 0: it always is",
     )
 
 

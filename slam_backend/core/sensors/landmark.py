@@ -233,7 +233,7 @@ def _mount(m: LandmarkObservation, context: Context, config: LandmarkSource) -> 
     return context.mount(config.frame if m.frame == UNNAMED else m.frame)
 
 
-def _level(
+def level(
     m: LandmarkObservation, context: Context, config: LandmarkSource
 ) -> tuple[LandmarkObservation, Pose]:
     """The sighting, and where its sensor sits. In the plane, a position in the optical frame of a camera, or of another
@@ -259,7 +259,7 @@ def _sight(offer: Offer, context: Context, config: LandmarkSource, points: dict[
     key = context.tag(m.landmark) if turned else context.landmark(m.landmark)
     if is_posed(key):
         return _tag(offer, key, context, config, points)
-    m, mount = _level(positioned(m), context, config)
+    m, mount = level(positioned(m), context, config)
     placed = context.landing(m.stamp)
     pose_key, space = placed.keyframe.pose, context.space
     known = key in points or context.component(key) is not None
