@@ -1,9 +1,10 @@
-"""Landmarks that stand still are landmarks; one that has moved, moves, or exists twice is taken out, with the reason.
+"""Landmarks that stand still are landmarks; one that has moved, or exists twice, becomes two, and one that moves is taken out, with the reason.
 
 What gives it away is the history of its residuals, after the solver has had its say: a pose that was off is corrected by then,
 and the other landmarks seen from the same pose fit again. One that goes on not fitting where others do is looked at closely:
 its sightings, drawn from the poses as they are believed now, lie at one place (the noise is larger than it says: nothing is
 done), at two, one after the other (it was moved), at two in turn (there are two of that name), or anywhere (it moves).
+Of two places it must be known that it is not the pose that is off (`witnesses.py`); what cannot be split (`splitting.py`) goes out.
 """
 
 from collections import defaultdict, deque
@@ -77,7 +78,8 @@ class Quarantine:
         decisions: list[Decision] = []
         suspects = self._noted(fresh, estimate)
         accused = self._splitter.accused(self._config.sightings)
-        ripe = [key for key in accused if len(self._histories[key].ids) >= 2 * self._config.split]
+        least = 2 * self._config.split
+        ripe = [key for key in accused if 0 < least <= len(self._histories[key].ids)]
         for key in dict.fromkeys((*suspects, *ripe)):
             if (found := self._verdict(key, estimate)) is None:
                 continue
@@ -164,16 +166,16 @@ class Quarantine:
         places = self._places(factors, estimate)
         limit = TIGHT * places.sigma
         two = parted(places, limit)
-        if spread(places.points) <= limit or (two and not self._are_two(two, estimate)):
-            history.strange.clear()  # the noise is larger than it says, or the pose was off
-            return None
         if two and len(history.ids) < REMEMBERED and two.fewest < self._config.split:
             return None  # soon there may be enough at either place
+        if spread(places.points) <= limit or (two and not self._is_witnessed(two, estimate)):
+            history.strange.clear()  # the noise is larger than it says, or the pose was off
+            return None
         if two is None:
             return Found("moving", None, spread(places.points), limit)
         return Found("duplicate" if two.since is None else "moved", two, two.apart, limit)
 
-    def _are_two(self, two: Parted, estimate: Estimate) -> bool:
+    def _is_witnessed(self, two: Parted, estimate: Estimate) -> bool:
         def fits(factor: Factor) -> bool:
             return self._residual(factor, estimate) <= limit
 

@@ -7,6 +7,8 @@ where they are: see `at_their_places`. It stays one, and goes into quarantine as
     either place has too few sightings,
     it has been split before: what is at a third place is not known to stand still anywhere,
     a person has decided something about one of its sightings: it could not be put back where it was.
+
+What has been split is not merged again: the merger goes on to know the scans of the whole.
 """
 
 from collections import defaultdict

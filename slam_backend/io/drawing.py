@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ..core.books import SECOND_PLACE
 from ..core.decisions import as_json
 from ..core.graph import Decision
 from ..core.measurement import SECOND, Array
@@ -46,14 +47,15 @@ def trajectory_cloud(stamp: int, frame: str, snapshot: Snapshot, covariances: Ar
 def landmark_cloud(stamp: int, frame: str, snapshot: Snapshot, covariances: ArrayLike | None) -> bytes:
     """PointCloud2, a point per landmark: id (uint32) x y z (float64) and, when given, cov (9).
 
-    Where every name is a number that fits, it is the id. Otherwise ids count the points of this message, and the names
-    travel in the field `name`: UTF-8 in uint8, filled up with zeros.
+    Where every name is a number that fits, it is the id, of both places of a number that is at two. Otherwise ids count the points of this
+    message. Where an id does not say all of a name, the names travel in the field `name`: UTF-8 in uint8, filled up with zeros.
     """
     names = snapshot.names
     columns: dict[str, NDArray[Any]] = {"id": np.arange(len(names), dtype=np.uint32)}
-    if all(_is_number(name) for name in names):
-        columns["id"] = np.array([int(name) for name in names], dtype=np.uint32)
-    else:
+    told = [name.removesuffix(SECOND_PLACE) for name in names]
+    if all(_is_number(name) for name in told):
+        columns["id"] = np.array([int(name) for name in told], dtype=np.uint32)
+    if not all(_is_number(name) for name in names):
         encoded = np.array([name.encode() for name in names])
         columns["name"] = encoded.view(np.uint8).reshape(len(names), encoded.itemsize)
     columns |= dict(zip("xyz", snapshot.landmarks.T, strict=True))

@@ -1,5 +1,7 @@
 """Proof by sampling, for everything that carries a covariance; and a drive that most tests of the whole core begin from."""
 
+from collections import Counter
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -11,15 +13,69 @@ from slam_backend.core.config import config_from
 from slam_backend.core.graph import EARTH
 from slam_backend.core.measurement import SECOND, frozen
 from slam_backend.core.sensors.gnss import Fix
+from slam_backend.core.sensors.landmark import LandmarkObservation
 from slam_backend.core.sensors.odometry import STILL, UNKNOWN, OdometryPose
 from slam_backend.core.sensors.relative import RelativePose
 from slam_backend.core.space import SPACES
+from slam_backend.core.trajectory import Trajectory
+from slam_backend.lab.options import Options
+from slam_backend.lab.simulate import simulate
 
 SIDE = 8  # keyframes of each side of the square
 ORIGIN = (42.3758, -71.1474, 12.0)
 ARM = (0.8, -0.3, 1.2)
 YAW = 2.0  # rad, of the earth in the map
 SIGMA = 0.3  # m, of a fix
+
+
+class Walk:
+    """A simulated drive among landmarks, and what comes of it when one of them is not where it was."""
+
+    def __init__(self, scenario: str, seed: int, options: Options) -> None:
+        self.drive = drive = simulate(scenario, seed, options)
+        self.sightings = [m for m in drive.measurements if isinstance(m, LandmarkObservation)]
+        self.most_seen = Counter(m.landmark for m in self.sightings).most_common(1)[0][0]
+        self.poses = dict(
+            zip(drive.stamps.tolist(), Trajectory(drive.stamps, drive.sevens).poses, strict=True)
+        )
+
+    def seen_at(self, sighting):
+        """Where in the map."""
+        pose = self.poses[sighting.stamp]
+        return pose[:3, :3] @ sighting.value + pose[:3, 3]
+
+    def told(self, displaced):
+        """The drive, with the sightings of the landmark that is seen most often as `displaced` has them: which of them, the point seen
+        -> the point told, or None.
+        """
+        count = 0
+        for m in self.drive.measurements:
+            if isinstance(m, LandmarkObservation) and m.landmark == self.most_seen:
+                there = displaced(count, self.seen_at(m))
+                count += 1
+                if there is not None:
+                    pose = self.poses[m.stamp]
+                    yield replace(m, value=frozen((there - pose[:3, 3]) @ pose[:3, :3]))
+            else:
+                yield m
+
+    def ran(self, items, **settings):
+        """The back-end at the end, and all decisions. settings: beside those of the drive."""
+        backend = Backend(config_from({**self.drive.settings, **settings}))
+        decisions = [d for item in items for update in backend.add(item) for d in update.decisions]
+        return backend, decisions + [d for update in backend.finish() for d in update.decisions]
+
+    def error(self, backend) -> float:
+        """Root mean square of the positions (m); both begin at the origin."""
+        found = backend.snapshot().trajectory
+        rows = np.searchsorted(self.drive.stamps, found.stamps)
+        gaps = np.linalg.norm(found.sevens[:, :3] - self.drive.sevens[rows, :3], axis=1)
+        return float(np.sqrt((gaps**2).mean()))
+
+
+@pytest.fixture(scope="session")
+def walk():
+    return Walk
 
 
 @pytest.fixture

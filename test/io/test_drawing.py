@@ -43,6 +43,13 @@ def test_one_name_that_is_no_number_sends_all_names_along(odd) -> None:
     assert [bytes(row).rstrip(b"\0").decode() for row in table["name"]] == ["7", odd, "eleven"]
 
 
+def test_a_number_that_is_at_two_places_is_the_id_of_both() -> None:
+    """And the names tell which is which; the ids of all others stay."""
+    table = landmarks("7", "5", "5~2")
+    assert table["id"].tolist() == [7, 5, 5]
+    assert [bytes(row).rstrip(b"\0").decode() for row in table["name"]] == ["7", "5", "5~2"]
+
+
 def test_without_landmarks_and_keyframes_there_are_empty_clouds() -> None:
     """And a graph that deletes what was drawn."""
     empty = snapshot_of(0)

@@ -224,6 +224,12 @@ RULES: Mapping[str, Rule] = {
     "landmark/quarantined": Rule(
         "warn", "another sighting of a landmark that has been taken out", "see quarantine/moved, moving and duplicate"
     ),
+    "landmark/elsewhere": Rule(
+        "warn", "a sighting of an id that is at two places, and of neither", "see splitting/moved and duplicate: give each landmark its own number"
+    ),
+    "landmark/ambiguous": Rule(
+        "note", "an id is at two places, and the sighting may be of both", "give each landmark its own number; several in view tell where the robot is"
+    ),
     "placing/undetermined": Rule(
         "note", "the sightings of a landmark seen by range or bearing alone do not place it yet", "drive round it; the first path is too straight"
     ),
