@@ -13,7 +13,6 @@ What has been split is not merged again: the merger goes on to know the scans of
 
 from collections import defaultdict
 from collections.abc import Callable, Collection, Mapping, Sequence
-from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -72,7 +71,7 @@ class Splitter:
         landmark = self._books.tag(new) if is_posed(key) else self._books.landmark(new)
         twins = None if associator else Twins((name, new), since)
         reason = "confused" if associator else "duplicate" if since is None else "moved"
-        self._planned[landmark] = Planned(_told(reason, (name, new), two, leaving, staying), name, twins)
+        self._planned[landmark] = Planned(_announced(reason, (name, new), two, leaving, staying), name, twins)
         moved = tuple(rekeyed(factor, key, landmark) for factor in leaving)
         return Delta(moved, tuple(factor.id for factor in leaving), {landmark: places[1]})
 
@@ -110,7 +109,7 @@ class Splitter:
         return [factor for factor, leaves in zip(sightings, second, strict=True) if leaves]
 
 
-def _told(
+def _announced(
     reason: str, names: tuple[str, str], two: Parted, leaving: Sequence[Factor], staying: int
 ) -> Decision:
     """The decision about the new landmark."""
@@ -152,7 +151,7 @@ def at_their_places(
         try:
             sorted_, told = _sorted(scan, name, a, context, config, books)
         except Unusable as why:
-            sorted_, told = [], [_of(offer, "refused", why.reason, why.detail) for offer in scan]
+            sorted_, told = [], [_told(offer, "refused", why.reason, why.detail) for offer in scan]
         found += sorted_
         decisions += told
     return found, decisions
@@ -175,13 +174,12 @@ def _sorted(
     found, decisions = [], []
     for n, offer in enumerate(scan):
         fits, closest = distances[n] <= limit, float(distances[n].min())
-        told = partial(_of, offer, statistic=closest, threshold=limit)
         if not fits.any():
-            decisions.append(told("refused", "elsewhere", f"{name} is at two places, and this is neither"))
+            why = f"{name} is at two places, and this is neither"
+            decisions.append(_told(offer, "refused", "elsewhere", why, closest, limit))
         elif n not in pairs or (fits.all() and since is None):
-            decisions.append(
-                told("refused", "ambiguous", f"{name} is at two places, and this may be of both")
-            )
+            why = f"{name} is at two places, and this may be of both"
+            decisions.append(_told(offer, "refused", "ambiguous", why, closest, limit))
         else:
             m = offer.measurement
             newer = since is not None and m.stamp >= since
@@ -189,7 +187,8 @@ def _sorted(
             if at == 0 and newer:  # it is at the first place again: there are two
                 books.twins[name] = Twins(twins.names, None)
             found.append(renamed(offer, twins.names[at]))
-            decisions.append(told("accepted", "sorted", f"of {twins.names[at]}"))
+            why = f"of {twins.names[at]}"
+            decisions.append(_told(offer, "accepted", "sorted", why, float(distances[n, at]), limit))
     return found, decisions
 
 
@@ -208,9 +207,8 @@ def _distances(
         m = offer.measurement
         assert isinstance(m, LandmarkObservation)
         if m.form in PLACELESS:
-            raise Unusable(
-                "ambiguous", f"{m.landmark} is at two places, and a {m.form} alone does not tell which"
-            )
+            why = f"{m.landmark} is at two places, and a {m.form} alone does not tell which"
+            raise Unusable("ambiguous", why)
         upright, mount = level(positioned(m), context, config)
         point, noise = as_point(upright, mount, placed.motion, context, config)
         points.append(point)
@@ -218,18 +216,14 @@ def _distances(
     part = context.component(placed.keyframe.pose)
     keys = {n: books.landmarks[name] for n, name in enumerate(names)}
     near = {n: key for n, key in keys.items() if context.component(key) == part}
-    if len(near) < len(keys) and any(context.component(key) not in (None, part) for key in keys.values()):
-        raise Unusable(
-            "ambiguous", f"{names[0]} is at two places, in a part of the map that is not connected yet"
-        )
-    places = np.array([_place(key, context) for key in near.values()]).reshape(
-        -1, context.space.point_dimension
-    )
+    if not near or any(context.component(key) not in (None, part) for key in keys.values()):
+        why = f"{names[0]} is at two places, and this part of the map does not know both"
+        raise Unusable("ambiguous", why)
+    places = np.array([_place(key, context) for key in near.values()])
     seen, covariance = predicted(placed.keyframe, list(near.values()), places, a, context)
+    prediction = Prediction(np.array(points)[:, None] - seen[None], np.array(noises), covariance)
     distances = np.full((len(scan), len(names)), np.inf)
-    if near:
-        prediction = Prediction(np.array(points)[:, None] - seen[None], np.array(noises), covariance)
-        distances[:, list(near)] = prediction.distances()
+    distances[:, list(near)] = prediction.distances()
     return distances
 
 
@@ -237,7 +231,7 @@ def _place(key: int, context: Context) -> Array:
     return np.asarray(context.pose(key).translation()) if is_posed(key) else context.point(key)
 
 
-def _of(
+def _told(
     offer: Offer,
     verdict: Verdict,
     reason: str,

@@ -22,7 +22,7 @@ SOURCE = "\n".join(
 FILES = [
     *sorted(CORE.glob("sensors/*.py")), *sorted(CORE.glob("firewall/*.py")), *sorted(CORE.glob("association/*.py")),
     *(CORE / name for name in ("beside.py", "budget.py", "calibration.py", "check.py", "coast.py", "context.py", "growth.py",
-                               "inertial.py", "quarantine.py", "settle.py", "waiting.py", "robust/doubt.py")),
+                               "inertial.py", "quarantine.py", "settle.py", "splitting.py", "waiting.py", "robust/doubt.py")),
 ]  # fmt: skip
 # Whoever is called to refuse -> where verdict, stage and reason stand among the arguments. A text is the stage itself;
 # None: there is no verdict but to refuse, or the stage is that of the file. `decided` needs no look: it takes its words from the table.
@@ -39,7 +39,7 @@ FORMS = {
 }
 OF_FILE = {
     "relative.py": "relative", "growth.py": "relative", "tag.py": "landmark", "landmark.py": "landmark", "pixels.py": "pixels",
-    "tracks.py": "pixels", "associator.py": "association", "doubt.py": "doubt", "budget.py": "budget", "context.py": "*",
+    "splitting.py": "landmark", "tracks.py": "pixels", "associator.py": "association", "doubt.py": "doubt", "budget.py": "budget", "context.py": "*",
 }  # fmt: skip
 TABLES = {  # dictionaries whose keys are reasons that a variable hands on
     ("tracks.py", "REASONS"): ("pixels", "points"),
