@@ -387,6 +387,20 @@ def test_a_bag_cut_at_any_byte_gives_what_comes_before_and_says_so(kind, tmp_pat
     assert share[-1] > 0.8
 
 
+def test_a_cut_database_is_read_to_the_last_row_on_a_whole_page(tmp_path) -> None:
+    records = recording(300, ties=False)
+    path, page = written("sqlite3", tmp_path, records), 4096
+    whole, data, cut = flat(records), path.read_bytes(), tmp_path / "cut.db3"
+    ends = np.array([data.index(record.data) + len(record.data) for record in records])
+    left_out = []
+    for at in range(len(data) // 4, len(data) // 2, page):
+        cut.write_bytes(data[: at + 100])
+        got, _ = attempt(cut)
+        assert got == whole[: len(got)]
+        left_out.append(int((ends <= (at + 100) // page * page).sum()) - len(got))
+    assert max(left_out) == 0
+
+
 @pytest.mark.parametrize("kind", KINDS)
 def test_no_changed_byte_makes_the_reader_stumble(kind, tmp_path) -> None:
     """100 bags with some bytes overwritten: records that were there or a clear line, never another exception."""

@@ -8,10 +8,11 @@ use, or was left by a crash: it is read with them. Journals of the node vouch fo
 import shutil
 import sqlite3
 from collections import Counter
-from collections.abc import Iterator
-from contextlib import ExitStack
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, suppress
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Any
 
 from .parts import Connection, Contents, Part, Row, Source, Topics
 from .sealed import UNREADABLE, is_sealed, rows_of
@@ -92,7 +93,7 @@ class _Bag:
         same: list[Row] = []  # rows with equal log times, to be ordered by topic
         last = None
         try:
-            for found in self.database.execute(query, wanted):
+            for found in _all_of(self.database, query, wanted):
                 row = self.row(*found)
                 if row is None:
                     continue
@@ -110,8 +111,8 @@ class _Bag:
         """What can be read by row number, then put in order of time."""
         found: list[tuple[int, str, int]] = []
         try:
-            for identity, topic, log_time, data in self.database.execute(
-                "SELECT id, topic_id, timestamp, data FROM messages ORDER BY id"
+            for identity, topic, log_time, data in _all_of(
+                self.database, "SELECT id, topic_id, timestamp, data FROM messages ORDER BY id"
             ):
                 row = self.row(identity, topic, log_time, data)
                 if row is not None:
@@ -138,6 +139,18 @@ class _Bag:
             row = self.row(*(answer or (identity, 0, None, None)))
             if row is not None:
                 yield row
+
+
+def _all_of(database: sqlite3.Connection, query: str, arguments: Sequence[int] = ()) -> Iterator[Any]:
+    """The rows of a query; before the error of one that cannot be read the last whole one, to which Python has looked ahead."""
+    n = 0
+    try:
+        for n, row in enumerate(database.execute(query, arguments), 1):  # noqa: B007  # how many there were
+            yield row
+    except UNREADABLE:
+        with suppress(*UNREADABLE):
+            yield from database.execute(f"{query} LIMIT 1 OFFSET {n}", arguments).fetchall()
+        raise
 
 
 def _connect(path: Path, how: str, stack: ExitStack) -> sqlite3.Connection:
