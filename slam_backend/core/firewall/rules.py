@@ -260,6 +260,9 @@ RULES: Mapping[str, Rule] = {
         "note", "of too many sightings of a landmark one that says least", "for more certainty raise the budget", None, "", "budget.sightings"
     ),
     "pixels/no_baseline": Rule("error", "stereo pixels without a baseline", "set 'camera.baseline', or use the right camera's info"),
+    "pixels/other_camera": Rule(
+        "warn", "the CameraInfo is of another frame than the pixels", "set 'info_topic' to that of the camera which took the images; if it is, let both say one frame_id"
+    ),
     "pixels/raw_stereo": Rule("error", "stereo pixels of raw images", "send pixels of rectified images, and set 'image: rectified'"),
     "pixels/id": Rule("warn", "the id of a feature is no whole number", "give each track a number of its own"),
     "pixels/not_finite": Rule("warn", "a pixel or its sigma is NaN, infinite or not positive", "drop features that are lost"),

@@ -10,7 +10,7 @@ import numpy as np
 
 from ..config import PixelsSource
 from ..errors import BadMessage
-from ..measurement import Array, Constant, Decoder, Message, stamp_of
+from ..measurement import Array, Constant, Decoder, Message, parse_frame, stamp_of
 from .triangulation import Lens
 
 MODELS = {"plumb_bob": 5, "rational_polynomial": 8}  # name in CameraInfo -> coefficients
@@ -21,12 +21,17 @@ EXACT = 1e-3  # pixels that distorting anew may differ by: beyond, the model doe
 @dataclass(frozen=True, slots=True, eq=False)
 class CameraModel(Constant):
     """Of a source. raw: of the image as taken; rectified: of the rectified one, with the baseline where the message is that of
-    the right camera. distortion: eight coefficients in OpenCV's order.
+    the right camera. distortion: eight coefficients in OpenCV's order. frame: the optical frame that was told, if any.
     """
 
     raw: Lens
     distortion: Array
     rectified: Lens
+    frame: str = ""
+
+    def is_of(self, frame: str) -> bool:
+        """Whether it may be of the camera that sees from a frame. That of a right camera is also of the left one of the pair."""
+        return not self.frame or self.frame == frame or self.rectified.baseline > 0
 
 
 def decode_info(message: Message, source: str) -> CameraModel:
@@ -36,7 +41,8 @@ def decode_info(message: Message, source: str) -> CameraModel:
     model = message.distortion_model
     if d.any() and model not in MODELS:
         raise BadMessage(f"distortion model '{model}' is not known; known: {', '.join(MODELS)}")
-    found = CameraModel(stamp_of(message), source, Lens(k[0], k[4], k[2], k[5]), _eight(d), rectified)
+    frame, _ = parse_frame(message.header.frame_id)
+    found = CameraModel(stamp_of(message), source, Lens(k[0], k[4], k[2], k[5]), _eight(d), rectified, frame)
     if not any(_usable(lens) for lens in (found.raw, found.rectified)):
         raise BadMessage("the camera is not calibrated: neither its K nor its P has focal lengths")
     return found

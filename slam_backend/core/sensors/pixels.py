@@ -5,7 +5,7 @@ the error of one motion among all its pixels, which would be counted as if each 
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from ..config import PixelsSource
 from ..context import Context, Unusable
 from ..errors import BadMessage
+from ..firewall.rules import decided
 from ..graph import Decision, Delta, Keyframe, Offer
 from ..measurement import Array, Decoder, Measurement, Message, frozen, parse_frame, stamp_of
 from .camera import DECODERS as INFO
@@ -79,7 +80,9 @@ def factors(
         except Unusable as why:
             delta += Delta(decisions=(_refused(offer, why.reason, why.detail),))
             continue
-        delta += Delta(decisions=refused) + tracker.take(frame, context, newest=frame.key == b.pose)
+        delta += Delta(decisions=(*_strange(offer, m, context, config, tracker), *refused)) + tracker.take(
+            frame, context, newest=frame.key == b.pose
+        )
     return delta
 
 
@@ -132,6 +135,18 @@ def _frame(
         offer.id, m.stamp, placed.keyframe.pose, mount, lens, m.ids[good], pixels[good], sigmas[good]
     )
     return frame, tuple(decisions)
+
+
+def _strange(
+    offer: Offer, m: PixelFrame, context: Context, config: PixelsSource, tracker: Tracker
+) -> tuple[Decision, ...]:
+    """Once for each frame: the calibration is another camera's. The pixels are used all the same: frames are named freely."""
+    model = configured(config, context.cameras.get(m.source))
+    if model is None or model.is_of(m.frame) or m.frame in tracker.strange:
+        return ()
+    tracker.strange.add(m.frame)
+    detail = f"seen from '{m.frame}', with the calibration of '{model.frame}'"
+    return (replace(decided(m, "accepted", "pixels/other_camera"), id=offer.id, detail=detail),)
 
 
 def _refused(offer: Offer, reason: str, detail: str, count: int = 1) -> Decision:

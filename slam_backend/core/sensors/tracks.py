@@ -111,6 +111,7 @@ class Tracker:
         self._tracks: dict[int, Track] = {}
         self._frames: list[Frame] = []
         self._generations: dict[int, int] = {}  # id -> how many features have had it
+        self.strange: set[str] = set()  # frames that have been said to be no match for the calibration
 
     def take(self, frame: Frame, context: Context, *, newest: bool) -> Delta:
         """All that a frame at a keyframe brings about. newest: its keyframe is new, and the pose only guessed."""

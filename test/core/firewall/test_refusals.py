@@ -122,7 +122,7 @@ def test_every_refusal_that_the_code_can_utter_has_a_row_with_advice(path: Path)
 
 def named() -> set[str]:
     """Ids as they stand in the code that judges."""
-    found = set(re.findall(r'"((?:check|settle|recheck|wait|imu|gnss|coast)/[a-z_]+)"', SOURCE))
+    found = set(re.findall(r'"((?:check|settle|recheck|wait|imu|gnss|coast|pixels)/[a-z_]+)"', SOURCE))
     found |= {f"check/{reason}" for reason in re.findall(r'Fault\(\s*"([a-z_]+)"', SOURCE)}
     for what in re.findall(r'Fault\(\s*f"\{what\}_([a-z_]+)"', SOURCE):
         found |= {f"check/covariance_{what}", f"check/information_{what}"}

@@ -57,7 +57,7 @@ def test_the_info_of_a_right_camera_has_the_baseline():
 
 def test_a_camera_without_calibration_or_of_an_unknown_kind_is_refused():
     empty = SimpleNamespace(k=np.zeros(9), p=np.zeros(12), d=[], distortion_model="plumb_bob")
-    stamp = SimpleNamespace(stamp=SimpleNamespace(sec=1, nanosec=0))
+    stamp = SimpleNamespace(stamp=SimpleNamespace(sec=1, nanosec=0), frame_id="eye")
     with pytest.raises(BadMessage, match="not calibrated"):
         decode_info(SimpleNamespace(**vars(empty), header=stamp), "eye")
     fish = SimpleNamespace(k=np.eye(3), p=np.zeros(12), d=[0.1], distortion_model="equidistant", header=stamp)

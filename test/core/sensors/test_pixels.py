@@ -13,6 +13,7 @@ from slam_backend.core.errors import BadConfig, BadMessage
 from slam_backend.core.geometry import matrix_of, seven_of_matrix
 from slam_backend.core.graph import Decision
 from slam_backend.core.measurement import SECOND, frozen
+from slam_backend.core.sensors.camera import CameraModel
 from slam_backend.core.sensors.odometry import STILL, UNKNOWN, OdometryPose
 from slam_backend.core.sensors.pixels import PixelFrame, decode
 from slam_backend.core.sensors.reprojection import Reprojection
@@ -248,6 +249,18 @@ def test_without_a_calibration_or_between_keyframes_a_frame_is_refused():
     drive.go()
     drive.backend.add(PixelFrame(SECOND // 2, "features", EYE, np.arange(1), np.ones((1, 3)), np.ones(1)))
     assert drive.go()["pixels/uncovered"] == 1
+
+
+@pytest.mark.parametrize(
+    ("frame", "baseline", "told"),
+    [("rear", 0.0, {"pixels/other_camera": 1}), (EYE, 0.0, {}), ("", 0.0, {}), ("right", 0.3, {})],
+)
+def test_the_calibration_of_another_camera_is_said_once(frame, baseline, told):
+    """That of the right camera of a pair has its own frame, and is the one to take."""
+    drive, lens = Drive(camera={}), LENS._replace(baseline=baseline)
+    drive.backend.add(CameraModel(0, "features", lens, np.zeros(8), lens, frame))
+    assert [drive.go(), drive.go()] == [told, {}]
+    assert not told or f"seen from '{EYE}', with the calibration of 'rear'" in drive.decisions[0].detail
 
 
 def test_a_keyframe_that_is_due_is_made_at_the_newest_image():
