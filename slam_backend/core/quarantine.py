@@ -61,15 +61,15 @@ class Quarantine:
         self._fresh: list[Factor] = []
         self._residuals: deque[float] = deque(maxlen=USUAL)
         self._leaving: list[int] = []  # what may have lost its last sighting
+        self._parting: set[str] = set()  # sightings that have just become another landmark's
 
     def admit(self, proposed: Delta, estimate: Estimate) -> Judged:  # noqa: ARG002  # of no kind of factor
         return proposed, ()
 
     def book(self, delta: Delta) -> None:
-        """What the solver has taken."""
-        self._fresh += [
-            f for f in delta.add if f.kind == "landmark" and isinstance(f.factor, (*PLACED, *TAGS))
-        ]
+        """What the solver has taken. What a split has moved is not judged by where the wrong name has bent the path."""
+        fresh = [f for f in delta.add if f.kind == "landmark" and isinstance(f.factor, (*PLACED, *TAGS))]
+        self._fresh += [f for f in fresh if f.id not in self._parting]
 
     def review(self, estimate: Estimate) -> Judged:
         fresh = [factor for factor in self._fresh if self._factors.get(factor.id) is factor]
@@ -80,8 +80,11 @@ class Quarantine:
         accused = self._splitter.accused(self._config.sightings)
         least = 2 * self._config.split
         ripe = [key for key in accused if 0 < least <= len(self._histories[key].ids)]
-        for key in dict.fromkeys((*suspects, *ripe)):
-            if (found := self._verdict(key, estimate)) is None:
+        looked_at = {key: self._verdict(key, estimate) for key in dict.fromkeys((*suspects, *ripe))}
+        verdicts = {key: found for key, found in looked_at.items() if found}
+        is_bent = any(found.two for found in verdicts.values())  # the path: who seems to move may stand still
+        for key, found in verdicts.items():
+            if (is_bent and not found.two) or self._is_early(key, found.two):
                 continue
             sightings = [f for f in self._factors.values() if f.kind == "landmark" and f.keys[1] == key]
             change = self._splitter.split(key, found.two, sightings, estimate) if found.two else None
@@ -91,6 +94,7 @@ class Quarantine:
             if change is not None:
                 del self._histories[key]
                 amendment += change
+        self._parting = {factor.id for factor in amendment.add}
         return amendment, tuple(decisions)
 
     def _taken_out(
@@ -166,14 +170,18 @@ class Quarantine:
         places = self._places(factors, estimate)
         limit = TIGHT * places.sigma
         two = parted(places, limit)
-        if two and len(history.ids) < REMEMBERED and two.fewest < self._config.split:
-            return None  # soon there may be enough at either place
         if spread(places.points) <= limit or (two and not self._is_witnessed(two, estimate)):
             history.strange.clear()  # the noise is larger than it says, or the pose was off
             return None
         if two is None:
             return Found("moving", None, spread(places.points), limit)
         return Found("duplicate" if two.since is None else "moved", two, two.apart, limit)
+
+    def _is_early(self, key: int, two: Parted | None) -> bool:
+        """Whether there may soon be enough sightings at either place."""
+        if two is None or len(self._histories[key].ids) == REMEMBERED:
+            return False
+        return two.fewest < self._config.split
 
     def _is_witnessed(self, two: Parted, estimate: Estimate) -> bool:
         def fits(factor: Factor) -> bool:

@@ -264,6 +264,13 @@ def test_what_moves_on_and_on_is_taken_out_as_a_whole(drive) -> None:
     assert about(decisions, "splitting", "quarantine") == {"quarantine/moving"}
 
 
+def test_nobody_else_pays_for_the_path_that_the_wrong_name_has_bent(walk) -> None:
+    """A neighbour, whose sightings are drawn from there, seems to move until the two places are told apart."""
+    drive = walk("square", 11, replace(OPTIONS, poses=400))
+    _, decisions = drive.ran(drive.told(twice))
+    assert about(decisions, "splitting", "quarantine") == {"splitting/duplicate"}
+
+
 def test_of_a_second_place_that_was_seen_too_rarely_nothing_is_made(drive) -> None:
     """It is taken out, as what is never split."""
     _, decisions = drive.ran(drive.told(twice), quarantine={"split": 40})
