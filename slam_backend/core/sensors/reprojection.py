@@ -11,8 +11,7 @@ import numpy as np
 from ..config import PixelsSource
 from ..graph import Factor
 from ..robust.kernels import with_kernel
-from .frames import Frame, Sighting
-from .triangulation import Lens
+from .frames import Frame
 
 # A point behind its camera gives a constant error and no gradient instead of an exception; the tracker removes it.
 SILENT = (False, False)
@@ -28,37 +27,34 @@ class Reprojection:
         )
         self._smart = _smart_parameters()
 
-    def of_point(self, number: int, sighting: Sighting, key: int) -> Factor:
+    def of_point(self, number: int, frame: Frame, row: int, key: int) -> Factor:
         """A feature that is seen where the point is."""
-        frame, row = sighting
-        u, v, right = frame.pixels[row].tolist()
-        mono = isnan(right)
-        noise = self._noise(float(frame.sigmas[row]), 2 if mono else 3)
-        mount = () if frame.mount.equals(_HERE, 0.0) else (frame.mount,)
+        u, v, right, sigma = frame.rows[row]
+        optics = frame.optics
         made: Any = (
             gtsam.GenericProjectionFactorCal3_S2(
-                np.array((u, v)), noise, frame.key, key, _mono(frame.lens), *SILENT, *mount
+                np.array((u, v)), self._noise(sigma, 2), frame.key, key, optics.mono, *SILENT, *optics.mount
             )
-            if mono
+            if isnan(right)
             else gtsam.GenericStereoFactor3D(
-                gtsam.StereoPoint2(u, right, v), noise, frame.key, key, _stereo(frame.lens), *SILENT, *mount
+                gtsam.StereoPoint2(u, right, v), self._noise(sigma, 3), frame.key, key, optics.stereo,
+                *SILENT, *optics.mount,
             )
-        )
+        )  # fmt: skip
         return Factor(id_of(number, frame), "pixel", made, (frame.key, key), frame.stamp)
 
-    def smart(self, number: int, sightings: Sequence[Sighting]) -> Factor:
-        """One factor for all sightings, the point eliminated. gtsam takes one noise for all: their root mean square."""
+    def smart(self, number: int, sightings: Sequence[tuple[Frame, int]]) -> Factor:
+        """One factor for all sightings, frames and rows in them, the point eliminated. gtsam takes one noise for all: their root
+        mean square.
+        """
         frame = sightings[-1][0]
         sigma = float(np.sqrt(np.mean([each.sigmas[row] ** 2 for each, row in sightings])))
         noise = gtsam.noiseModel.Isotropic.Sigma(2, sigma)
-        made = gtsam.SmartProjectionPoseFactorCal3_S2(noise, _mono(frame.lens), frame.mount, self._smart)
+        made = gtsam.SmartProjectionPoseFactorCal3_S2(noise, frame.optics.mono, frame.mount, self._smart)
         for each, row in sightings:
             made.add(each.pixels[row, :2], each.key)
         keys = tuple(each.key for each, _ in sightings)
         return Factor(f"{id_of(number, frame)}:smart", "pixel", made, keys, frame.stamp)
-
-
-_HERE = gtsam.Pose3()
 
 
 def id_of(number: int, frame: Frame) -> str:
@@ -73,13 +69,3 @@ def _smart_parameters() -> gtsam.SmartProjectionParams:
     )
     params.setRankTolerance(RANK)
     return params
-
-
-@cache
-def _mono(lens: Lens) -> gtsam.Cal3_S2:
-    return gtsam.Cal3_S2(lens.fx, lens.fy, 0.0, lens.cx, lens.cy)
-
-
-@cache
-def _stereo(lens: Lens) -> gtsam.Cal3_S2Stereo:
-    return gtsam.Cal3_S2Stereo(lens.fx, lens.fy, 0.0, lens.cx, lens.cy, lens.baseline)

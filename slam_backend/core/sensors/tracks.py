@@ -10,6 +10,7 @@ odometry nor a feature that jumped makes a point. Nothing is believed for good: 
 again by what the solver made of them; one that is behind a camera, or that its sightings do not agree on, is removed.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
@@ -18,10 +19,10 @@ from numpy.typing import NDArray
 
 from ..config import PixelsSource
 from ..context import Context
-from ..graph import Decision, Delta, Motion, Pose, total
+from ..graph import Decision, Delta, Factor, Motion, Pose, total
 from ..measurement import Array
 from ..robust.chi2 import chi2_limits
-from .frames import Frame, Poses, Sighting
+from .frames import Film, Frame, Poses
 from .reprojection import Reprojection, id_of
 from .resection import Known, judged, resected
 from .triangulation import Lens, Sightings, covariances, images, triangulated
@@ -32,6 +33,7 @@ REFUSED, REMOVED = (
 )  # stages of decisions: about what a message says, about what is in the graph
 KEPT = 12  # sightings of a point that are looked at again
 SPARED = 3  # sightings that a point keeps at least when one of them is found wrong; else all of it goes
+NOTHING = Known(np.zeros((0, 3)), np.zeros((0, 3, 3)), np.zeros((0, 3)), np.zeros(0))
 REASONS = {
     "outlier": "it is not where its point is seen from there",
     "disagrees": "no point is where all sightings of the feature see it",
@@ -43,52 +45,38 @@ STRIKES = 3  # sightings in a row that do not fit, after which the feature is he
 
 @dataclass(eq=False, slots=True)
 class Track:
-    """One feature. name: of its point. sightings: the newest last. key: of the point, once it is a variable; factors: ids of
-    what is in the graph because of it. strikes: sightings in a row that did not fit.
+    """One feature. name: of its point. sightings: numbers in the film, the newest last. key: of the point, once it is a variable;
+    factors: ids of what is in the graph because of it. strikes: sightings in a row that did not fit.
     """
 
     id: int
     name: str
-    sightings: list[Sighting] = field(default_factory=list)
+    sightings: list[int] = field(default_factory=list)
     key: int | None = None
     factors: list[str] = field(default_factory=list)
     strikes: int = 0
 
-    @property
-    def newest(self) -> Frame:
-        return self.sightings[-1][0]
 
-
-class InGraph(NamedTuple):
-    """Tracks that are in the graph, with their points (T, 3) in the map and the covariances (T, 3, 3) of these."""
+class InView(NamedTuple):
+    """Tracks of the graph that a frame shows, in its rows (K,): what is known of their points, and where it shows them."""
 
     tracks: list[Track]
-    points: Array
-    covariances: Array
-
-    def only(self, rows: list[int]) -> "InGraph":
-        return InGraph([self.tracks[n] for n in rows], self.points[rows], self.covariances[rows])
-
-    def seen_in(self, frame: Frame) -> tuple[list[Track], Known]:
-        """Those that a frame shows, as it shows them."""
-        rows = {number: row for row, number in enumerate(frame.ids.tolist())}
-        which = [n for n, track in enumerate(self.tracks) if track.id in rows]
-        at = np.array([rows[self.tracks[n].id] for n in which], dtype=np.intp)
-        known = Known(self.points[which], self.covariances[which], frame.pixels[at], frame.sigmas[at])
-        return [self.tracks[n] for n in which], known
+    rows: NDArray[np.intp]
+    known: Known
 
 
-def in_graph(tracks: list[Track], seen: Sightings, context: Context, lens: Lens) -> InGraph:
-    """What the estimate makes of tracks now. Smart factors have no point of their own: it is sought; NaN where there is none."""
+def in_graph(tracks: list[Track], seen: Sightings, context: Context, lens: Lens) -> Array:
+    """(T, 3) where the estimate has the points of tracks now. Smart factors have none of their own: it is sought; NaN where there
+    is none.
+    """
     points = np.zeros((len(tracks), 3))
     smart = np.array([track.key is None for track in tracks])
     if smart.any():
         found = triangulated(seen.only(smart)._replace(covariances=None), lens)
         points[smart] = np.where(np.isinf(found.share)[:, None], np.nan, found.points)
-    for n, track in enumerate(tracks):
-        if track.key is not None:
-            points[n] = context.point(track.key)
-    return InGraph(tracks, points, covariances(points, seen, lens))
+    if not smart.all():
+        points[~smart] = [context.point(track.key) for track in tracks if track.key is not None]
+    return points
 
 
 def disagreement(points: Array, seen: Sightings, lens: Lens) -> tuple[Array, Array, NDArray[np.bool_]]:
@@ -110,6 +98,7 @@ class Tracker:
         self._make = Reprojection(config)
         self._tracks: dict[int, Track] = {}
         self._frames: list[Frame] = []
+        self._film = Film()
         self._generations: dict[int, int] = {}  # id -> how many features have had it
         self.strange: set[str] = set()  # frames that have been said to be no match for the calibration
 
@@ -120,17 +109,17 @@ class Tracker:
             return Delta(decisions=(refusal,))
         self._forget(frame, context)
         poses = Poses(context)
-        known, removed = self._reviewed(frame, context, poses)
-        values = self._placed(frame, known, context, poses) if newest else {}
-        refusals = self._gated(frame, known, poses)
-        self._sighted(frame, {refusal.id for refusal in refusals})
+        view, removed = self._reviewed(frame, context, poses)
+        values = self._placed(frame, view.known, context, poses) if newest else {}
+        refused, refusals = self._gated(frame, view, poses)
+        self._sighted(frame, refused)
         return total([removed, Delta(values=values, decisions=refusals), self._grown(frame, context, poses)])
 
     # -- what is forgotten -------------------------------------------------------------------------
 
     def _forget(self, frame: Frame, context: Context) -> None:
-        """Tracks that ended; those of frames whose keyframe was taken back, or lies in another part of the graph; those whose
-        factors somebody took out. All of them when the camera is another one.
+        """Frames whose keyframe was taken back, or lies in another part of the graph, with all tracks that they show; all of them
+        when the camera is another one. Then tracks that ended.
         """
         part = context.component(frame.key)
 
@@ -142,15 +131,42 @@ class Tracker:
                 and other.mount.equals(frame.mount, 1e-9)
             )  # fmt: skip
 
-        lost = {id(other) for other in self._frames if not stands(other)}
-        self._frames = [other for other in self._frames if id(other) not in lost][-self._config.forget :]
-        alive = {id(other) for other in self._frames}
-        self._tracks = {
-            track.id: track for track in self._tracks.values()
-            if id(track.sightings[-1][0]) in alive and not (lost and any(id(each) in lost for each, _ in track.sightings))
-            and (track.key is None or context.component(track.key) is not None)
-            and (track.key is not None or all(map(context.kept, track.factors)))
-        }  # fmt: skip
+        lost = [other for other in self._frames if not stands(other)]
+        self._frames = [other for other in self._frames if other not in lost][-self._config.forget :]
+        for other in lost:
+            shown = range(other.first, other.first + len(other.ids))
+            gone = [t for t in self._tracks.values() if any(each in shown for each in t.sightings)]
+            for track in gone:
+                self._drop(track)
+        if len(self._film) >= 2 * self._config.forget:
+            self._sweep()
+
+    def _sweep(self) -> None:
+        """What is asked for again is found to have ended anyway; this is only for the memory."""
+        oldest = self._oldest
+        self._tracks = {n: track for n, track in self._tracks.items() if track.sightings[-1] >= oldest}
+        self._film.cut(min((track.sightings[0] for track in self._tracks.values()), default=oldest))
+
+    @property
+    def _oldest(self) -> int:
+        """The first sighting of a track that may go on."""
+        return self._frames[0].first if self._frames else self._film.end
+
+    def _going_on(self, numbers: list[int], context: Context) -> Iterator[Track]:
+        """The tracks with these ids, but those that ended, and those whose factors somebody took out."""
+        oldest = self._oldest
+        for number in numbers:
+            track = self._tracks.get(number)
+            if track is None:
+                continue
+            key = track.key
+            held = (
+                all(map(context.kept, track.factors)) if key is None else context.component(key) is not None
+            )
+            if held and track.sightings[-1] >= oldest:
+                yield track
+            else:
+                self._drop(track)
 
     def _drop(self, track: Track) -> None:
         """Whatever is seen with its id from now on is another feature."""
@@ -158,38 +174,45 @@ class Tracker:
 
     # -- what is in the graph ----------------------------------------------------------------------
 
-    def _reviewed(self, frame: Frame, context: Context, poses: Poses) -> tuple[InGraph, Delta]:
-        """The tracks of the graph that are in view or were in the last frame, less those that are given up now."""
-        last, now = self._frames[-1:], set(frame.ids.tolist())
-        near = dict.fromkeys([*(n for each in last for n in each.ids.tolist()), *frame.ids.tolist()])
+    def _reviewed(self, frame: Frame, context: Context, poses: Poses) -> tuple[InView, Delta]:
+        """The tracks of the graph that are in view or were in the last frame are judged anew; of those that are not given up now,
+        the ones in view.
+        """
+        rows = {number: row for row, number in enumerate(frame.ids.tolist())}
+        last, since = (self._frames[-1].ids.tolist(), self._frames[-1].first) if self._frames else ([], 0)
         tracks = [
             track
-            for number in near
-            if (track := self._tracks.get(number))
-            and track.factors
-            and (number in now or track.newest in last)
+            for track in self._going_on(list(dict.fromkeys([*last, *rows])), context)
+            if track.factors and (track.id in rows or track.sightings[-1] >= since)
         ]
         if not tracks:
-            return InGraph([], np.zeros((0, 3)), np.zeros((0, 3, 3))), Delta()
-        seen = poses.sightings([track.sightings for track in tracks])
-        known = in_graph(tracks, seen, context, frame.lens)
-        chi2, freedom, behind = disagreement(known.points, seen, frame.lens)
+            return InView([], np.zeros(0, np.intp), NOTHING), Delta()
+        seen = self._film.sightings([track.sightings for track in tracks], poses)
+        points = in_graph(tracks, seen, context, frame.lens)
+        chi2, freedom, behind = disagreement(points, seen, frame.lens)
         limits = chi2_limits(self._config.probability, freedom)
-        bad = np.flatnonzero(behind | (np.add.reduceat(chi2, seen.starts) > limits)).tolist()
+        bad = behind | (np.add.reduceat(chi2, seen.starts) > limits)
         removed = []
-        for n in bad:
+        for n in np.flatnonzero(bad).tolist():
             each = chi2[seen.starts[n] :][: len(tracks[n].sightings)]
             gone, reason = self._given_up(tracks[n], each, bool(behind[n]), context)
             removed.append(self._removal(gone, reason, tracks[n], frame.stamp, float(each.sum()), limits[n]))
-        good = [n for n, track in enumerate(tracks) if self._tracks.get(track.id) is track]
-        return known.only(good), total(removed)
+        at = np.array([rows.get(t.id, -1) if self._tracks.get(t.id) is t else -1 for t in tracks])
+        shown, at = at >= 0, at[at >= 0]
+        known = Known(
+            points[shown],
+            covariances(points[shown], seen.only(shown), frame.lens),
+            frame.pixels[at],
+            frame.sigmas[at],
+        )
+        return InView([tracks[n] for n in np.flatnonzero(shown).tolist()], at, known), total(removed)
 
     def _given_up(self, track: Track, chi2: Array, behind: bool, context: Context) -> tuple[list[str], str]:
         """Factors of a point that contradicts its sightings: of the worst of many, else all of them."""
         gone = track.factors
         if track.key is not None and len(track.sightings) > SPARED and not behind:
-            worst, _ = track.sightings.pop(int(np.argmax(chi2)))
-            gone = [id_of(track.id, worst)]
+            worst = track.sightings.pop(int(np.argmax(chi2)))
+            gone = [id_of(track.id, self._film.at(worst)[0])]
         else:
             self._drop(track)
         track.factors = [each for each in track.factors if each not in gone]
@@ -206,14 +229,14 @@ class Tracker:
 
     # -- the new frame -----------------------------------------------------------------------------
 
-    def _placed(self, frame: Frame, known: InGraph, context: Context, poses: Poses) -> dict[int, Pose]:
+    def _placed(self, frame: Frame, known: Known, context: Context, poses: Poses) -> dict[int, Pose]:
         """Resect the frame's pose: its keyframe starts there."""
         if not self._frames:
             return {}
         before, to_camera = self._frames[-1], frame.mount.inverse().AdjointMap()
         grown = context.motion(before.stamp, frame.stamp).covariance
         prior = Motion(context.pose(frame.key), grown)
-        found = resected(prior, frame.mount, known.seen_in(frame)[1], frame.lens)
+        found = resected(prior, frame.mount, known, frame.lens)
         frame.covariance = to_camera @ found.covariance @ to_camera.T
         if found is prior:  # no better known than the frame before
             frame.covariance = frame.covariance + before.covariance
@@ -221,34 +244,37 @@ class Tracker:
         poses.put(frame, found.pose)
         return {frame.key: found.pose}
 
-    def _gated(self, frame: Frame, known: InGraph, poses: Poses) -> tuple[Decision, ...]:
-        """Sightings that are not where their point must be seen."""
-        tracks, seen = known.seen_in(frame)
-        if not tracks:
-            return ()
-        _, _, chi2 = judged(poses.of(frame), seen, frame.lens, frame.covariance)
-        limits = chi2_limits(self._config.probability, 2 + np.isfinite(seen.pixels[:, 2]))
-        refusals = []
-        for n in np.flatnonzero(chi2 > limits).tolist():
-            refusals.append(self._refusal(id_of(tracks[n].id, frame), frame, "outlier", chi2[n], limits[n]))
-            self._strike(tracks[n])
-        return tuple(refusals)
+    def _gated(self, frame: Frame, view: InView, poses: Poses) -> tuple[set[int], tuple[Decision, ...]]:
+        """Sightings that are not where their point must be seen: their rows."""
+        if not view.tracks:
+            return set(), ()
+        known = view.known
+        _, _, chi2 = judged(poses.of(frame), known, frame.lens, frame.covariance)
+        limits = chi2_limits(self._config.probability, 2 + np.isfinite(known.pixels[:, 2]))
+        refusals, wrong = [], np.flatnonzero(chi2 > limits)
+        for n in wrong.tolist():
+            track = view.tracks[n]
+            refusals.append(self._refusal(id_of(track.id, frame), frame, "outlier", chi2[n], limits[n]))
+            self._strike(track)
+        return set(view.rows[wrong].tolist()), tuple(refusals)
 
     def _strike(self, track: Track) -> None:
         track.strikes += 1
         if track.strikes >= STRIKES:
             self._drop(track)
 
-    def _sighted(self, frame: Frame, refused: set[str]) -> None:
-        """Book the frame's features, those of new tracks too."""
+    def _sighted(self, frame: Frame, refused: set[int]) -> None:
+        """Book the frame's features, those of new tracks too. refused: rows."""
+        self._film.add(frame)
         self._frames.append(frame)
+        tracks = self._tracks
         for row, number in enumerate(frame.ids.tolist()):
-            if id_of(number, frame) in refused:
+            if row in refused:
                 continue
-            track = self._tracks.get(number)
+            track = tracks.get(number)
             if track is None:
-                track = self._tracks[number] = Track(number, self._name(number))
-            track.sightings.append((frame, row))
+                track = tracks[number] = Track(number, self._name(number))
+            track.sightings.append(frame.first + row)
             if track.key is not None:
                 track.strikes = 0
                 del track.sightings[:-KEPT]
@@ -261,46 +287,53 @@ class Tracker:
 
     def _grown(self, frame: Frame, context: Context, poses: Poses) -> Delta:
         """Factors for what the frame has seen."""
-        tracks = [t for n in frame.ids.tolist() if (t := self._tracks.get(n)) and t.newest is frame]
-        deltas = [self._followed(track, track.key) for track in tracks if track.key is not None]
+        tracks = [
+            t for n in frame.ids.tolist() if (t := self._tracks.get(n)) and t.sightings[-1] >= frame.first
+        ]
+        grown = Delta(tuple(self._followed(t, t.key, frame) for t in tracks if t.key is not None))
         unplaced = [track for track in tracks if track.key is None and len(track.sightings) > 1]
         if not unplaced:
-            return total(deltas)
-        found = triangulated(poses.sightings([track.sightings for track in unplaced]), frame.lens)
+            return grown
+        seen = self._film.sightings([track.sightings for track in unplaced], poses)
+        found = triangulated(seen, frame.lens)
         limits = chi2_limits(self._config.probability, found.freedom)
-        for n, track in enumerate(unplaced):
-            if found.chi2[n] > limits[n]:
-                deltas.append(self._disagreed(frame, track, found.chi2[n], limits[n]))
-            elif found.share[n] < self._config.share:
-                track.strikes = 0
-                deltas.append(self._made(track, found.points[n], context))
-        return total(deltas)
+        stereo = np.logical_or.reduceat(seen.stereo, seen.starts)
+        contradicted, near = found.chi2 > limits, found.share < self._config.share
+        refusals = [
+            self._disagreed(frame, unplaced[n], found.chi2[n], limits[n])
+            for n in np.flatnonzero(contradicted).tolist()
+        ]
+        made = [
+            self._made(unplaced[n], found.points[n], bool(stereo[n]), context)
+            for n in np.flatnonzero(near & ~contradicted).tolist()
+        ]
+        return total([grown, *made, Delta(decisions=tuple(refusals))])
 
-    def _followed(self, track: Track, key: int) -> Delta:
-        factor = self._make.of_point(track.id, track.sightings[-1], key)
+    def _followed(self, track: Track, key: int, frame: Frame) -> Factor:
+        factor = self._make.of_point(track.id, frame, track.sightings[-1] - frame.first, key)
         track.factors.append(factor.id)
-        return Delta((factor,))
+        return factor
 
-    def _disagreed(self, frame: Frame, track: Track, chi2: float, limit: float) -> Delta:
+    def _disagreed(self, frame: Frame, track: Track, chi2: float, limit: float) -> Decision:
         """The newest sighting does not count. An older one may be the wrong one: then the next will not fit either."""
-        refusal = self._refusal(id_of(track.id, frame), frame, "disagrees", chi2, limit)
         track.sightings.pop()
         self._strike(track)
-        return Delta(decisions=(refusal,))
+        return self._refusal(id_of(track.id, frame), frame, "disagrees", chi2, limit)
 
-    def _made(self, track: Track, point: Array, context: Context) -> Delta:
+    def _made(self, track: Track, point: Array, stereo: bool, context: Context) -> Delta:
         """The smart factor anew, or the point as a variable."""
         remove = tuple(track.factors)
-        stereo = any(np.isfinite(frame.pixels[row, 2]) for frame, row in track.sightings)
-        if len(track.sightings) < self._config.point_after and not stereo:
-            factor = self._make.smart(track.id, track.sightings)
+        track.strikes = 0
+        sightings = [self._film.at(each) for each in track.sightings]
+        if len(sightings) < self._config.point_after and not stereo:
+            factor = self._make.smart(track.id, sightings)
             track.factors = [factor.id]
             return Delta((factor,), remove)
         while (
             context.component(key := context.landmark(track.name)) is not None
         ):  # of a map that is continued
             track.name = self._name(track.id)
-        made = tuple(self._make.of_point(track.id, each, key) for each in track.sightings)
+        made = tuple([self._make.of_point(track.id, *each, key) for each in sightings])
         track.key, track.factors = key, [factor.id for factor in made]
         del track.sightings[:-KEPT]
         return Delta(made, remove, {key: point})

@@ -176,7 +176,7 @@ def test_a_smart_factor_says_what_its_sightings_would_with_the_best_point():
     smart = make.smart(5, sightings)
     graph = gtsam.NonlinearFactorGraph()
     for each in sightings:
-        graph.add(make.of_point(5, each, 99).factor)
+        graph.add(make.of_point(5, *each, 99).factor)
     for k in range(3):
         graph.add(gtsam.NonlinearEqualityPose3(k, values.atPose3(k)))
     best = gtsam.Values(values)
