@@ -6,7 +6,8 @@ import numpy as np
 
 from ..graph import Motion, Pose
 from ..measurement import Array
-from .triangulation import Lens, cross, images, of_image, whitening
+from .symmetric import products, times
+from .triangulation import Lens, by_tangent, of_image, pixels_of, ratios, whitening
 
 STEPS = 8  # of Gauss-Newton
 CAUCHY = 2.3849  # standard deviations: 95 % efficiency where all is well
@@ -33,11 +34,11 @@ def resected(prior: Motion, body_T_camera: Pose, known: Known, lens: Lens) -> Mo
     for _ in range(STEPS):
         error, jacobian, chi2 = judged(pose.compose(body_T_camera), known, lens)
         weights = 1 / (1 + chi2 / CAUCHY**2)
-        jacobian = jacobian @ to_camera
-        weighted = np.swapaxes(jacobian, 1, 2) * weights[:, None, None]
-        curvature = information + (weighted @ jacobian).sum(axis=0)
+        columns = (to_camera.T @ jacobian).swapaxes(0, 1)
+        weighted = (columns * weights).reshape(6, -1)
+        curvature = information + weighted @ columns.reshape(6, -1).T
         away = type(pose).Logmap(prior.pose.between(pose))
-        gradient = (weighted @ error[:, :, None]).sum(axis=0)[:, 0] - information @ away
+        gradient = weighted @ error.ravel() - information @ away
         step = np.linalg.solve(curvature, gradient)
         pose = pose.retract(step)
         if np.abs(step).max() < 1e-6:
@@ -50,25 +51,26 @@ def resected(prior: Motion, body_T_camera: Pose, known: Known, lens: Lens) -> Mo
 def judged(
     map_T_camera: Pose, known: Known, lens: Lens, pose_covariance: Array | None = None
 ) -> tuple[Array, Array, Array]:
-    """Whitened errors (N, 3), Jacobian (N, 3, 6) by the camera's tangent, chi-square (N,); infinite where the point is behind.
+    """Whitened errors (3, N), Jacobian (3, 6, N) by the camera's tangent, chi-square (N,); infinite where the point is behind.
 
     pose_covariance: at the camera's tangent; None: the pose is exact.
     """
-    poses = np.broadcast_to(map_T_camera.matrix(), (len(known.sigmas), 4, 4))
-    expected, local = images(known.points, poses, lens)
-    stereo = np.isfinite(known.pixels[:, 2])
-    behind = local[:, 2] <= 0
+    turn, place = map_T_camera.rotation().matrix(), map_T_camera.translation()
+    local = np.ascontiguousarray(((known.points - place) @ turn).T)
+    mono, behind = ~np.isfinite(known.pixels[:, 2]), local[2] <= 0
     with np.errstate(all="ignore"):
-        by_point = of_image(local, lens, lens.baseline)
-    by_point[~stereo, 2] = 0.0
-    by_point[behind] = 0.0
-    error = np.where(behind[:, None], 0.0, known.pixels - expected)
-    error[~stereo, 2] = 0.0
-    by_pose = np.concatenate([by_point @ cross(local), -by_point], axis=2)
-    in_camera = by_point @ poses[:, :3, :3].swapaxes(1, 2)
-    noise = in_camera @ known.covariances @ np.swapaxes(in_camera, 1, 2)
+        shown = ratios(local, lens.baseline)
+        by_point = of_image(shown, local[2], turn.T[:, :, None], lens)
+        by_pose = of_image(shown, local[2], by_tangent(local), lens)
+        error = known.pixels.T - pixels_of(shown, lens)
+    for each in (by_point, by_pose, error):
+        each[2, ..., mono] = 0.0
+        each[..., behind] = 0.0
+    noises = np.ascontiguousarray(known.covariances.transpose(1, 2, 0))
+    spread = (by_point[:, :, None] * noises).sum(axis=1)
+    noise = products(spread, by_point)
     if pose_covariance is not None:
-        noise = noise + by_pose @ pose_covariance @ np.swapaxes(by_pose, 1, 2)
+        noise += products(pose_covariance @ by_pose, by_pose)
     root = whitening(noise, known.sigmas)
-    error = (root @ error[:, :, None])[:, :, 0]
-    return error, root @ by_pose, np.where(behind, np.inf, (error**2).sum(axis=1))
+    error = times(root, error)
+    return error, times(root, by_pose), np.where(behind, np.inf, (error**2).sum(axis=0))

@@ -98,7 +98,7 @@ class Tracker:
         self._make = Reprojection(config)
         self._tracks: dict[int, Track] = {}
         self._frames: list[Frame] = []
-        self._film = Film()
+        self._film, self._full = Film(), config.forget
         self._generations: dict[int, int] = {}  # id -> how many features have had it
         self.strange: set[str] = set()  # frames that have been said to be no match for the calibration
 
@@ -138,7 +138,7 @@ class Tracker:
             gone = [t for t in self._tracks.values() if any(each in shown for each in t.sightings)]
             for track in gone:
                 self._drop(track)
-        if len(self._film) >= 2 * self._config.forget:
+        if len(self._film) >= self._full:
             self._sweep()
 
     def _sweep(self) -> None:
@@ -146,6 +146,7 @@ class Tracker:
         oldest = self._oldest
         self._tracks = {n: track for n, track in self._tracks.items() if track.sightings[-1] >= oldest}
         self._film.cut(min((track.sightings[0] for track in self._tracks.values()), default=oldest))
+        self._full = len(self._film) + self._config.forget
 
     @property
     def _oldest(self) -> int:

@@ -11,10 +11,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..measurement import Array
+from .symmetric import DIAGONAL, cholesky, full, inverse_factor, products, six_of, times, transposed_times
+from .symmetric import inverse as symmetric_inverse
 
 Rows = NDArray[np.intp]
 
-STEPS = 6  # of Gauss-Newton; from the linear solution two or three do
+STEPS = 3  # of Gauss-Newton from the linear solution, and again once the poses' covariances are taken into account
+SETTLED = 1e-9  # largest step of the state after which no more is made
 NEAR = 1e-3  # of the image's distance: what lies nearer to a camera's plane, or behind it, has no image
 
 
@@ -75,169 +78,185 @@ class Points(NamedTuple):
 
 
 class _Views(NamedTuple):
-    """From the camera that saw a track first to each that saw it: turns (N, 3, 3), shifts (N, 3). tracks (N,), stereo (N,)."""
+    """From the camera that saw a track first to each that saw it. moves: (3, 3, N) how q moves with the state; axis: (3, N) where it is
+    at a state of zeros; tracks (N,), stereo (N,).
+    """
 
-    turns: Array
-    shifts: Array
+    moves: Array
+    axis: Array
     tracks: Rows
     stereo: NDArray[np.bool_]
 
 
 def triangulated(seen: Sightings, lens: Lens) -> Points:
     """The most likely point of each track, and what is to be thought of it. Poses are taken as they are, up to their covariances."""
-    views, starts = _views(seen), seen.starts
-    state = _linear(seen, lens, views)
-    weights = np.eye(3) / seen.sigmas[:, None, None]
+    views, starts, pixels = _views(seen), seen.starts, seen.pixels.T.copy()
+    state = _linear(pixels, starts, lens, views)
+    weights = np.zeros((6, len(seen.sigmas)))
+    weights[DIAGONAL] = 1 / seen.sigmas
     with np.errstate(all="ignore"):  # a track without a solution is found out at the end
-        for n in range(STEPS):
-            error, jacobian, q = _projected(state, seen.pixels, lens, views)
-            if n == STEPS // 2 and seen.covariances is not None and seen.covariances.any():
-                weights = _whitening(seen, _by_pose(q, state[views.tracks, 2], lens, views.stereo))
-            step, _ = _solved(weights @ jacobian, _apply(weights, error), starts)
-            state = state + np.where(np.isfinite(step), step, 0.0)
-        error, jacobian, q = _projected(state, seen.pixels, lens, views)
-        error = _apply(weights, error)
-        _, information = _solved(weights @ jacobian, error, starts)
-        chi2, sigma = (
-            np.add.reduceat((error**2).sum(axis=1), starts),
-            np.sqrt(np.linalg.inv(information)[:, 2, 2]),
-        )
-        inverse, ahead = state[:, 2], np.minimum.reduceat(q[:, 2], starts) > NEAR
+        state = _descended(state, pixels, weights, starts, lens, views)
+        if seen.covariances is not None and seen.covariances.any():
+            _, _, q = _projected(state, pixels, lens, views)
+            weights = _whitening(seen, q, state[2, views.tracks], lens, views.stereo)
+            state = _descended(state, pixels, weights, starts, lens, views)
+        error, jacobian, q = _projected(state, pixels, lens, views)
+        error = times(weights, error)
+        factor, _ = _normal(times(weights, jacobian), error, starts)
+        chi2, sigma = np.add.reduceat((error**2).sum(axis=0), starts), 1 / factor[5]
+        inverse, ahead = state[2], np.minimum.reduceat(q[2], starts) > NEAR
         good = (inverse > 0) & ahead & np.isfinite(sigma) & np.isfinite(chi2)
-        rays = np.column_stack([state[:, :2], np.ones(len(state))]) / inverse[:, None]
+        rays = np.column_stack([state[0], state[1], np.ones(len(starts))]) / inverse[:, None]
         points = (seen.poses[starts, :3, :3] @ rays[:, :, None])[:, :, 0] + seen.poses[starts, :3, 3]
         share = np.where(good, sigma / inverse, np.inf)
     return Points(points, share, chi2, np.add.reduceat(2.0 + views.stereo, starts) - 3)
+
+
+def _descended(state: Array, pixels: Array, weights: Array, starts: Rows, lens: Lens, views: _Views) -> Array:
+    for _ in range(STEPS):
+        error, jacobian, _ = _projected(state, pixels, lens, views)
+        factor, gradient = _normal(times(weights, jacobian), times(weights, error), starts)
+        lower = inverse_factor(factor)
+        step = transposed_times(lower, times(lower, gradient))
+        step = np.where(np.isfinite(step), step, 0.0)
+        state = state + step
+        if np.abs(step).max() < SETTLED:
+            break
+    return state
 
 
 def images(points: Array, poses: Array, lens: Lens) -> tuple[Array, Array]:
     """(N, 3) u, v, and u in the right camera, of (N, 3) points seen from (N, 4, 4) map_T_camera; (N, 3) the points in the camera."""
     local = _local(points, poses)
     with np.errstate(all="ignore"):
-        return _image(local, lens, np.ones(len(local))), local
+        return pixels_of(ratios(local.T, lens.baseline), lens).T, local
 
 
 def covariances(points: Array, seen: Sightings, lens: Lens) -> Array:
     """(T, 3, 3) in the map, of (T, 3) points by their sightings alone, from cameras that stand where they stand."""
+    local = _local(points[seen.tracks], seen.poses).T.copy()
+    turns = np.ascontiguousarray(seen.poses[:, :3, :3].transpose(2, 1, 0))
     with np.errstate(all="ignore"):
-        local = _local(points[seen.tracks], seen.poses)
-        by_point = of_image(local, lens, lens.baseline) @ np.swapaxes(seen.poses[:, :3, :3], 1, 2)
-    by_point = np.nan_to_num(by_point) / seen.sigmas[:, None, None]
-    by_point[np.isnan(seen.pixels[:, 2]), 2] = 0.0
-    information = np.add.reduceat(np.swapaxes(by_point, 1, 2) @ by_point, seen.starts)
-    information[:, range(3), range(3)] += 1e-9 * np.trace(information, axis1=1, axis2=2)[:, None] + 1e-12
-    return np.linalg.inv(information)
+        by_point = of_image(ratios(local, lens.baseline), local[2], turns, lens) / seen.sigmas
+    by_point = np.nan_to_num(by_point)
+    by_point[2][:, np.isnan(seen.pixels[:, 2])] = 0.0
+    by_point = by_point.swapaxes(0, 1)
+    information = np.add.reduceat(products(by_point, by_point), seen.starts, axis=1)
+    information[DIAGONAL] += 1e-9 * information[DIAGONAL].sum(axis=0) + 1e-12
+    return symmetric_inverse(information)
 
 
 def _local(points: Array, poses: Array) -> Array:
     return np.asarray((points - poses[:, :3, 3])[:, None, :] @ poses[:, :3, :3])[:, 0]
 
 
-def _image(local: Array, lens: Lens, scale: Array) -> Array:
-    """Of points in the camera, times a scale by which the baseline is multiplied too."""
-    x, y, z = local.T
-    return np.column_stack(
-        [
-            lens.fx * x / z + lens.cx,
-            lens.fy * y / z + lens.cy,
-            lens.fx * (x - lens.baseline * scale) / z + lens.cx,
-        ]
-    )
+def ratios(local: Array, baseline: Array | float) -> Array:
+    """(3, N) x / z and y / z in the left camera, x / z in the right one, of (3, N) points in the left one; baseline in their scale."""
+    x, y, z = local
+    return np.asarray(np.array([x, y, x - baseline]) / z)
+
+
+def pixels_of(ratios: Array, lens: Lens) -> Array:
+    """(3, N) u, v, right u."""
+    return np.asarray(ratios * _focal(lens) + np.array([[lens.cx], [lens.cy], [lens.cx]]))
+
+
+def _focal(lens: Lens) -> Array:
+    return np.array([[lens.fx], [lens.fy], [lens.fx]])
+
+
+def of_image(ratios: Array, depths: Array, moves: Array, lens: Lens) -> Array:
+    """(3, K, N) derivative of u, v, right u by K parameters. ratios: (3, N) of points at depths (N,); moves: (3, K, N), or (3, K, 1)
+    where they are those of all, how these points move with the parameters.
+    """
+    scale = (_focal(lens) / depths)[:, None]
+    return np.asarray(scale * (moves[[0, 1, 0]] - ratios[:, None] * moves[2]))
+
+
+def by_tangent(local: Array, scale: Array | float = 1.0) -> Array:
+    """(3, 6, N) how points in the camera (3, N) move with the camera's tangent, rotation first. scale: that of the points."""
+    x, y, z = local
+    moves = np.zeros((3, 6, local.shape[1]))
+    moves[1, 0], moves[2, 1], moves[0, 2] = z, x, y
+    moves[2, 0], moves[0, 1], moves[1, 2] = -y, -z, -x
+    moves[0, 3] = moves[1, 4] = moves[2, 5] = -scale
+    return moves
 
 
 def _views(seen: Sightings) -> _Views:
     tracks = seen.tracks
     first = seen.poses[seen.starts][tracks]
     back = np.swapaxes(seen.poses[:, :3, :3], 1, 2)
-    shifts = (back @ (first[:, :3, 3] - seen.poses[:, :3, 3])[:, :, None])[:, :, 0]
-    return _Views(back @ first[:, :3, :3], shifts, tracks, seen.stereo)
+    turns = np.ascontiguousarray((back @ first[:, :3, :3]).transpose(1, 2, 0))
+    shifts = np.ascontiguousarray((back @ (first[:, :3, 3] - seen.poses[:, :3, 3])[:, :, None])[:, :, 0].T)
+    return _Views(
+        np.stack([turns[:, 0], turns[:, 1], shifts], axis=1), turns[:, 2].copy(), tracks, seen.stereo
+    )
 
 
-def _linear(seen: Sightings, lens: Lens, views: _Views) -> Array:
-    """(T, 3): the direction as seen first, the inverse distance by least squares from all other images."""
-    image = (seen.pixels - [lens.cx, lens.cy, lens.cx]) / [lens.fx, lens.fy, lens.fx]
-    ray = np.column_stack([image[seen.starts, :2], np.ones(len(seen.starts))])
-    q = (views.turns @ ray[views.tracks][:, :, None])[:, :, 0]
-    base = np.array([[0.0, 0.0, lens.baseline]])
-    gain = views.shifts[:, [0, 1, 0]] - base - image * views.shifts[:, 2:]
-    wanted = image * q[:, 2:] - q[:, [0, 1, 0]]
-    gain[~views.stereo, 2] = wanted[~views.stereo, 2] = 0.0
-    square = np.add.reduceat((gain**2).sum(axis=1), seen.starts)
-    product = np.add.reduceat((gain * wanted).sum(axis=1), seen.starts)
+def _linear(pixels: Array, starts: Rows, lens: Lens, views: _Views) -> Array:
+    """(3, T): the direction as seen first, the inverse distance by least squares from all other images."""
+    image = (pixels - np.array([[lens.cx], [lens.cy], [lens.cx]])) / _focal(lens)
+    ray = image[:2, starts]
+    a, b = ray[:, views.tracks]
+    q = views.moves[:, 0] * a + views.moves[:, 1] * b + views.axis
+    shifts = views.moves[:, 2]
+    gain = shifts[[0, 1, 0]] - image * shifts[2]
+    gain[2] -= lens.baseline
+    wanted = image * q[2] - q[[0, 1, 0]]
+    gain[2, ~views.stereo] = wanted[2, ~views.stereo] = 0.0
+    square, product = np.add.reduceat(
+        np.stack([(gain**2).sum(axis=0), (gain * wanted).sum(axis=0)]), starts, axis=1
+    )
     inverse = product / np.maximum(square, np.finfo(float).tiny)
-    return np.column_stack([ray[:, :2], np.maximum(inverse, 0.0)])
+    return np.stack([ray[0], ray[1], np.maximum(inverse, 0.0)])
 
 
 def _projected(state: Array, pixels: Array, lens: Lens, views: _Views) -> tuple[Array, Array, Array]:
-    """Errors (N, 3), measured minus expected; the image's Jacobian (N, 3, 3) by the state; the point in the camera over its first
-    distance (N, 3).
+    """Errors (3, N), measured minus expected; the image's Jacobian (3, 3, N) by the state; the point in the camera over its first
+    distance (3, N).
     """
-    state, stereo = state[views.tracks], views.stereo
-    rays = np.column_stack([state[:, :2], np.ones(len(state))])
-    q = (views.turns @ rays[:, :, None])[:, :, 0] + views.shifts * state[:, 2:]
-    error = pixels - _image(q, lens, state[:, 2])
-    of_state = np.concatenate([views.turns[:, :, :2], views.shifts[:, :, None]], axis=2)
-    jacobian = of_image(q, lens, lens.baseline * state[:, 2]) @ of_state
-    jacobian[:, 2, 2] -= lens.fx * lens.baseline / q[:, 2]
-    error[~stereo, 2] = 0.0
-    jacobian[~stereo, 2] = 0.0
+    state, mono = state[:, views.tracks], ~views.stereo
+    q = (views.moves * state).sum(axis=1) + views.axis
+    shown = ratios(q, lens.baseline * state[2])
+    error, jacobian = pixels - pixels_of(shown, lens), of_image(shown, q[2], views.moves, lens)
+    jacobian[2, 2] -= lens.fx * lens.baseline / q[2]
+    error[2, mono] = 0.0
+    jacobian[2][:, mono] = 0.0
     return error, jacobian, q
 
 
-def of_image(q: Array, lens: Lens, baseline: Array | float) -> Array:
-    """(N, 3, 3) derivative of u, v, right u by the (N, 3) point in the camera, the baseline in the same scale."""
-    x, y, z = q.T
-    found = np.zeros((len(q), 3, 3))
-    found[:, 0, 0] = found[:, 2, 0] = lens.fx / z
-    found[:, 1, 1] = lens.fy / z
-    found[:, 0, 2], found[:, 1, 2] = -lens.fx * x / z**2, -lens.fy * y / z**2
-    found[:, 2, 2] = -lens.fx * (x - baseline) / z**2
-    return found
-
-
-def _by_pose(q: Array, inverse: Array, lens: Lens, stereo: NDArray[np.bool_]) -> Array:
-    """(N, 3, 6) derivative of the image by the camera's tangent. inverse: (N,) of the distance, in the scale of q (N, 3)."""
-    by_point = of_image(q, lens, lens.baseline * inverse)
-    by_point[~stereo, 2] = 0.0
-    return np.concatenate([by_point @ cross(q), -by_point * inverse[:, None, None]], axis=2)
-
-
-def cross(vectors: Array) -> Array:
-    """(N, 3, 3) with [v] w = v x w: how a point in the camera moves when the camera turns by w."""
-    x, y, z = vectors.T
-    zero = np.zeros(len(vectors))
-    return np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=1).reshape(-1, 3, 3)
-
-
-def _whitening(seen: Sightings, by_pose: Array) -> Array:
-    """(N, 3, 3) W with W^T W the information of an image whose camera stands where it stands by its covariance."""
+def _whitening(seen: Sightings, q: Array, inverse: Array, lens: Lens, stereo: NDArray[np.bool_]) -> Array:
+    """(6, N) of images whose cameras stand where they stand by their covariances. inverse: (N,) of the distance, the scale of q (3, N)."""
     assert seen.covariances is not None
-    noise = by_pose @ seen.covariances @ np.swapaxes(by_pose, 1, 2)
-    return whitening(noise, seen.sigmas)
+    moves = by_tangent(q, inverse)
+    by_pose = of_image(ratios(q, lens.baseline * inverse), q[2], moves, lens)
+    by_pose[2][:, ~stereo] = 0.0
+    each = by_pose.transpose(2, 0, 1)
+    return whitening(six_of(each @ seen.covariances @ each.transpose(0, 2, 1)), seen.sigmas)
 
 
 def whitening(noise: Array, sigmas: Array) -> Array:
-    """(N, 3, 3) W with W^T W the inverse of (N, 3, 3) noise plus that of the pixels themselves, (N,). What is not finite of the
+    """(6, N) lower W with W^T W the inverse of (6, N) noise plus that of the pixels themselves, (N,). What is not finite of the
     noise is left out, and what rounding has made of directions without noise.
     """
     noise = np.where(np.isfinite(noise), noise, 0.0)
-    noise[:, range(3), range(3)] += (sigmas**2)[:, None]
-    try:
-        return np.linalg.inv(np.linalg.cholesky(noise))
-    except np.linalg.LinAlgError:
-        values, vectors = np.linalg.eigh((noise + np.swapaxes(noise, 1, 2)) / 2)
-        values = np.maximum(values, (sigmas**2)[:, None])
-        return np.asarray(np.swapaxes(vectors, 1, 2) / np.sqrt(values)[:, :, None])
+    noise[DIAGONAL] += sigmas**2
+    found = inverse_factor(cholesky(noise))
+    bad = ~np.isfinite(found).all(axis=0)
+    if bad.any():
+        values, vectors = np.linalg.eigh(full(noise[:, bad]))
+        values = np.maximum(values, (sigmas[bad] ** 2)[:, None])
+        mended = (vectors * values[:, None]) @ np.swapaxes(vectors, 1, 2)
+        found[:, bad] = inverse_factor(cholesky(six_of(mended)))
+    return found
 
 
-def _apply(matrices: Array, vectors: Array) -> Array:
-    return np.asarray((matrices @ vectors[:, :, None])[:, :, 0])
-
-
-def _solved(jacobian: Array, error: Array, starts: Rows) -> tuple[Array, Array]:
-    """The step (T, 3) of each track, and its information (T, 3, 3), from whitened rows."""
-    back = np.swapaxes(jacobian, 1, 2)
-    information = np.add.reduceat(back @ jacobian, starts)
-    information[:, range(3), range(3)] += 1e-12 * (1 + np.trace(information, axis1=1, axis2=2))[:, None]
-    gradient = np.add.reduceat(_apply(back, error), starts)
-    return np.linalg.solve(information, gradient[:, :, None])[:, :, 0], information
+def _normal(jacobian: Array, error: Array, starts: Rows) -> tuple[Array, Array]:
+    """The factor (6, T) of each track's information, and its gradient (3, T), from whitened rows."""
+    columns = jacobian.swapaxes(0, 1)
+    sums = np.concatenate([products(columns, columns), (columns * error).sum(axis=1)])
+    sums = np.add.reduceat(sums, starts, axis=1)
+    information, gradient = sums[:6], sums[6:]
+    information[DIAGONAL] += 1e-12 * (1 + information[DIAGONAL].sum(axis=0))
+    return cholesky(information), gradient

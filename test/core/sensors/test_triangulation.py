@@ -6,10 +6,11 @@ import pytest
 from slam_backend.core.sensors.triangulation import (
     Lens,
     Sightings,
+    by_tangent,
     covariances,
-    cross,
     images,
     of_image,
+    ratios,
     triangulated,
 )
 from slam_backend.lab.world import exp_of
@@ -87,8 +88,8 @@ def test_derivatives_are_those_of_the_image():
     """By central differences: of the point in the camera, and of the camera's tangent."""
     rng = np.random.default_rng(1)
     points, poses = rng.uniform([-1, -1, 3], [1, 1, 8], (20, 3)), np.tile(np.eye(4), (20, 1, 1))
-    by_point = of_image(points, STEREO, STEREO.baseline)
-    by_pose = np.concatenate([by_point @ cross(points), -by_point], axis=2)
+    shown = ratios(points.T, STEREO.baseline)
+    by_pose = of_image(shown, points[:, 2], by_tangent(points.T), STEREO).transpose(2, 0, 1)
     for k in range(6):
         step = np.zeros(6)
         step[k] = 1e-6
