@@ -10,7 +10,7 @@ from .parts import Parts
 from .sessions import SavedMap
 from .solvers import Solver
 from .space import Space
-from .variables import moved, pose_beside, seen_from, value_in
+from .variables import moved, pose_beside, value_in
 
 FOUNDATION = frozenset({"gauge", "motion"})  # kinds without which a keyframe cannot be
 
@@ -50,11 +50,17 @@ class Applier:
         verdicts: by id, why a factor may enter; told of those that the solver takes.
         """
         self._verdicts = verdicts or {}
-        while (event := next((f for f in delta.add if self._connects(f)), None)) is not None:
+        while (event := self._event(delta.add)) is not None:
             before, delta = _split(delta, event)
             self._solve(before)
             self._connect(event)
         self._solve(delta)
+
+    def _event(self, factors: Sequence[Factor]) -> Factor | None:
+        """The first that connects something. Where all is one part, only an absolute pose can; a camera adds hundreds of others."""
+        if len(self._parts) < 2:
+            factors = [factor for factor in factors if factor.kind == "pose"]
+        return next((factor for factor in factors if self._connects(factor)), None)
 
     def _connects(self, factor: Factor) -> bool:
         if factor.kind == "pose":
@@ -204,15 +210,17 @@ class Applier:
             self.sighted.pop(key, None)
 
     def _book(self, delta: Delta) -> None:
-        started: dict[int, Pose] = {}  # a camera makes hundreds of points at one pose
+        back: dict[int, Pose] = {}  # a camera makes hundreds of points at one pose
+        known = self._parts.all()
         for factor in delta.add:
-            for key in [key for key in factor.keys if self._parts.of(key) is None]:
-                pose = pose_beside(factor.keys[0])
-                if pose not in started:
-                    started[pose] = self._started(delta, pose)
-                self._parts.put(key, pose)
-                self.sighted[key] = (pose, seen_from(started[pose], key, delta.values[key]))
-                self._wake(key)
+            for key in factor.keys:
+                if key not in known:
+                    pose = pose_beside(factor.keys[0])
+                    if pose not in back:
+                        back[pose] = self._started(delta, pose).inverse()
+                    self._parts.put(key, pose)
+                    self.sighted[key] = (pose, moved(back[pose], key, delta.values[key]))
+                    self._wake(key)
             if factor.kind == "datum" and (part := self._parts.of(factor.keys[0])) is not None:
                 self._parts.release(part)
             if factor.kind in ("loop", "pose") or factor.id in self._verdicts:

@@ -93,7 +93,7 @@ class Change:
         books.decisions += delta.decisions
         books.decisions += [told for each in delta.waits for told in waiting.wait(each)]
         window = [*window, *waiting.landed(delta.values, {factor.id for factor in delta.add})]
-        judged = tuple(factor for factor in delta.add if self.jury.judges(factor.kind))
+        judged = tuple([factor for factor in delta.add if self.jury.judges(factor.kind)])
         sure = without(delta, {factor.id for factor in judged})
         try:
             books.applier.apply(sure)

@@ -85,6 +85,10 @@ def is_posed(key: int) -> bool:
     return kind_of(key) is POSE
 
 
+def is_point(key: int) -> bool:
+    return kind_of(key) is POINT
+
+
 def value_in(space: Space, values: gtsam.Values, key: int) -> Any:
     return kind_of(key).read(space, values, key)
 
@@ -94,13 +98,8 @@ def estimate_in(space: Space, isam: gtsam.ISAM2, key: int) -> Any:
 
 
 def moved(shift: Pose, key: int, value: Any) -> Any:
-    """The value when all that is in the map is moved by `shift`."""
+    """The value when all that is in the map is moved by `shift`; by the inverse of a pose, the value as seen from there."""
     return kind_of(key).moved(shift, value)
-
-
-def seen_from(pose: Pose, key: int, value: Any) -> Any:
-    """The value in the frame of a pose; `moved(pose, key, ...)` takes it back."""
-    return kind_of(key).moved(pose.inverse(), value)
 
 
 def numbers(space: Space, key: int, value: Any) -> tuple[float, ...]:

@@ -15,6 +15,7 @@ strongly anisotropic information; once it has thrown for no single factor's faul
 from collections import deque
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
+from itertools import count
 from math import isfinite
 from typing import Any
 
@@ -27,7 +28,7 @@ from ..firewall.rules import FARTHEST
 from ..graph import Decision, Delta, Estimate, Factor, Pose, is_pose
 from ..measurement import Array
 from ..space import Space
-from ..variables import estimate_in, is_posed, largest
+from ..variables import estimate_in, is_point, is_posed, largest
 from .salvage import salvaged
 
 SETTLED = 1e-10  # largest change of a variable (m, rad) at which a rebuild is done
@@ -120,8 +121,7 @@ class Isam2:
         # a pixel is less linear than all else: what is off its point of linearization now is an outlier at the next frame
         params.force_relinearize = "pixel" in kinds
         self._isam.update(graph, values, params)
-        for i, factor in enumerate(delta.add):
-            self._slots[factor.id] = first + i
+        self._slots.update(zip((factor.id for factor in delta.add), count(first)))
         if kinds & JOINING:
             for _ in range(self._config.extra_updates):
                 result = self._isam.update(gtsam.NonlinearFactorGraph(), gtsam.Values(), self._force)
@@ -131,12 +131,26 @@ class Isam2:
     def _check(self, delta: Delta) -> None:
         """Garbage without a throw: what the change adds or joins must be finite, and on this planet."""
         joined = (key for factor in delta.add if factor.kind in JOINING for key in factor.keys)
-        for key in {**delta.values, **dict.fromkeys(joined)}:
-            if not largest(self._space, key, self._believed.value(key)) < FARTHEST:
-                raise RuntimeError(
-                    f"estimate is not finite, or leaves the world, near variable {gtsam.DefaultKeyFormatter(key)}"
-                )
+        astray = self._astray({**delta.values, **dict.fromkeys(joined)})
+        if astray is not None:
+            raise RuntimeError(
+                f"estimate is not finite, or leaves the world, near variable {gtsam.DefaultKeyFormatter(astray)}"
+            )
         _check_held(self._isam, self._released(delta))
+
+    def _astray(self, keys: Iterable[int]) -> int | None:
+        """The first of some variables that is not finite, or not on this planet; points, of which a camera makes hundreds, at once."""
+        points, others = list[int](), list[int]()
+        for key in keys:
+            (points if is_point(key) else others).append(key)
+        if points:
+            within = np.abs([self._believed.point(key) for key in points]).max(axis=1) < FARTHEST
+            if not within.all():
+                return points[int(within.argmin())]
+        return next(
+            (key for key in others if not largest(self._space, key, self._believed.value(key)) < FARTHEST),
+            None,
+        )
 
     def _released(self, delta: Delta) -> set[int]:
         """What removed factors held, and others must hold now.
@@ -154,8 +168,7 @@ class Isam2:
         for key in released:
             if not self._isam.valueExists(key):
                 self._guesses.pop(key, None)
-        for factor in delta.add:
-            self.factors[factor.id] = factor
+        self.factors.update((factor.id, factor) for factor in delta.add)
         self._guesses.update(delta.values)
 
     def _move(self, delta: Delta) -> None:
