@@ -1,8 +1,14 @@
 """Points from pixels: exact where nothing errs, as certain as they say where something does, and derivatives that are ones."""
 
+import gtsam
 import numpy as np
 import pytest
+from gtsam.symbol_shorthand import L, X
 
+from slam_backend.core.config import PixelsSource
+from slam_backend.core.sensors.frames import Frame
+from slam_backend.core.sensors.reprojection import Reprojection
+from slam_backend.core.sensors.resection import Known, judged
 from slam_backend.core.sensors.triangulation import (
     Lens,
     Sightings,
@@ -95,3 +101,65 @@ def test_derivatives_are_those_of_the_image():
         step[k] = 1e-6
         ends = [images(points, poses @ exp_of(sign * step[None])[0], STEREO)[0] for sign in (1, -1)]
         np.testing.assert_allclose(by_pose[:, :, k], (ends[0] - ends[1]) / 2e-6, rtol=1e-5, atol=1e-3)
+
+
+@LENSES
+def test_images_and_derivatives_are_gtsams(lens):
+    """Of a mounted camera, pixel by pixel: the error of the factor, and its Jacobian by the pose of the body and by the point."""
+    rng = np.random.default_rng(2)
+    body = gtsam.Pose3(gtsam.Rot3.RzRyRx(0.1, -0.2, 0.7), np.array([1.0, -2.0, 0.4]))
+    mount = gtsam.Pose3(gtsam.Rot3.RzRyRx(-1.5, 0.1, -1.6), np.array([0.2, 0.1, 0.3]))
+    camera = body.compose(mount)
+    local = rng.uniform([-3, -2, 2], [3, 2, 20], (40, 3))
+    points = np.array([camera.transformFrom(each) for each in local])
+    pixels = rng.uniform(0, 600, (40, 3)) if lens.baseline else np.full((40, 3), np.nan)
+    pixels[:, :2] = rng.uniform(0, 600, (40, 2))
+    expected, _ = images(points, np.tile(camera.matrix(), (40, 1, 1)), lens)
+    known = Known(points, np.zeros((40, 3, 3)), pixels, np.full(40, 0.5))
+    error, jacobian, chi2 = judged(camera, known, lens)
+    frame = Frame("f", 0, X(0), mount, lens, np.arange(40), pixels, np.full(40, 0.5))
+    rows = [0, 2, 1] if lens.baseline else [0, 1]  # gtsam's order of a stereo pixel
+    by_body, values = mount.inverse().AdjointMap(), gtsam.Values()
+    values.insert(X(0), body)
+    values.insert(L(0), np.zeros(3))
+    for n in range(40):
+        values.update(L(0), points[n])
+        factor = Reprojection(PixelsSource()).of_point(n, frame, n, L(0)).factor
+        np.testing.assert_allclose(
+            factor.unwhitenedError(values), (expected - pixels)[n, rows], rtol=1e-9, atol=1e-9
+        )
+        matrix, _ = factor.linearize(values).jacobian()
+        np.testing.assert_allclose(jacobian[rows, :, n] @ by_body, matrix[:, :6], rtol=1e-7, atol=1e-7)
+        np.testing.assert_allclose(error[rows, n], -factor.whitenedError(values), rtol=1e-9, atol=1e-9)
+        assert chi2[n] == pytest.approx(2 * factor.error(values))
+
+
+@LENSES
+def test_what_gtsam_finds_behind_a_camera_is_behind_it(lens):
+    """Points all around: where gtsam's camera throws, and nowhere else, a point has no chi-square and moves nothing."""
+    rng = np.random.default_rng(3)
+    points = rng.uniform(-5, 5, (60, 3))
+    pixels = np.full((60, 3), 100.0)
+    if not lens.baseline:
+        pixels[:, 2] = np.nan
+    calibration = (lens.fx, lens.fy, 0.0, lens.cx, lens.cy)
+
+    def is_behind(point):
+        try:
+            if lens.baseline:
+                gtsam.StereoCamera(gtsam.Pose3(), gtsam.Cal3_S2Stereo(*calibration, lens.baseline)).project(
+                    point
+                )
+            else:
+                gtsam.PinholeCameraCal3_S2(gtsam.Pose3(), gtsam.Cal3_S2(*calibration)).project(point)
+        except RuntimeError:
+            return True
+        return False
+
+    behind = np.array([is_behind(point) for point in points])
+    assert 10 < behind.sum() < 50
+    known = Known(points, np.tile(np.eye(3), (60, 1, 1)), pixels, np.ones(60))
+    _, jacobian, chi2 = judged(gtsam.Pose3(), known, lens, np.eye(6) * 1e-4)
+    np.testing.assert_array_equal(np.isinf(chi2), behind)
+    assert not jacobian[:, :, behind].any()
+    assert jacobian[:, :, ~behind].any(axis=(0, 1)).all()
