@@ -26,7 +26,7 @@ TITLE = "Accuracy on real data"
 EXPLANATION = (
     "Position errors in metres against each data set's truth, with the settings named in `bench/`. Baseline: what the row names "
     "(dead reckoning, interpolation); value: ours, or what the bound is about. Sets that are not at hand are left out. "
-    "MRCLAM, robot 3: its ranges are 1.8 % too short in the mean, and nothing else tells the size of its map (docs/sensors.md)."
+    "MRCLAM: one setting for all robots; path and landmarks are laid over the truth by one rigid fit, that of the path (docs/sensors.md)."
 )
 SHARED = Path(__file__).parents[2] / "shared/data"
 

@@ -42,8 +42,11 @@ GIVEN = {
     "range_scale": 1.0,
     "distance_scale": 1.0,
     "turn_scale": 1.0,
+    "distance_per_radian": 0.0,
+    "turn_per_meter": 0.0,
     "time_offset": 0.0,
 }  # settings, and what does nothing
+TINY = 1e-12  # m: of a way of nothing, nothing is lost
 KEY = int(C(0))  # of the constants, in the linear system only
 
 Rebuild = Callable[[Array, Array], dict[str, Factor]]  # constants, anchor (see `context`) -> factors by id
@@ -61,6 +64,8 @@ QUANTITIES: Mapping[str, Quantity] = {
     "range_scale": Quantity(0.2, 1e-4, ""),
     "distance_scale": Quantity(0.2, 1e-4, ""),
     "turn_scale": Quantity(0.2, 1e-4, ""),
+    "distance_per_radian": Quantity(0.2, 1e-4, "m/rad"),
+    "turn_per_meter": Quantity(0.2, 1e-4, "rad/m"),
     "time_offset": Quantity(0.5, 1e-3, "s"),
     "translation": Quantity(0.5, 1e-4, "m"),
     "rotation": Quantity(0.5, 1e-4, "rad"),
@@ -155,7 +160,7 @@ class Calibration:
         home = late if anchor is None else round(self._correction(source, anchor).time_offset * SECOND)
 
         def moved(start: int, end: int) -> Motion:
-            return _scaled(self._space, context.motion(start, end), driving)
+            return _corrected(self._space, context.motion(start, end), driving)
 
         def placed(stamp: int) -> Placed | None:
             found = context.place(stamp + home)
@@ -163,7 +168,7 @@ class Calibration:
                 return None
             if home != late:
                 return Placed(found.keyframe, moved(found.keyframe.stamp, stamp + late))
-            return replace(found, motion=found.motion and _scaled(self._space, found.motion, driving))
+            return replace(found, motion=found.motion and _corrected(self._space, found.motion, driving))
 
         return replace(context, correction=own, place=placed, motion=moved)
 
@@ -334,10 +339,10 @@ class Calibration:
                 continue
             if constant.name in MOUNT:
                 six[MOUNT.index(constant.name) * 3 + constant.axis] = number
-            elif constant.name == "time_offset":
-                told[constant.name] += number
-            else:
+            elif constant.name.endswith("scale"):
                 told[constant.name] *= 1 + number
+            else:
+                told[constant.name] += number
         return Correction(**told, mount=self._space.from_extrinsics(six.tolist()) if six.any() else None)
 
     def _shown(self, constant: Constant, number: float, sigma: float | None) -> Found:
@@ -383,13 +388,26 @@ def _columns(space: Space, source: str, name: str) -> list[Constant]:
     return [Constant(source, part, axis) for part in parts for axis in axes.get(part, (0,))]
 
 
-def _scaled(space: Space, motion: Motion, driving: Correction) -> Motion:
-    """A motion whose distances and turns are so many times too large, along its constant twist."""
-    if driving.distance_scale == driving.turn_scale == 1.0:
+def _corrected(space: Space, motion: Motion, driving: Correction) -> Motion:
+    """A motion as it was, along its constant twist. Beside the scales: unequal wheels turn in proportion to the way (Borenstein & Feng,
+    T-RA 1996), and wheels that slip or lag in a turn lose way in proportion to it, at most all of it.
+    """
+    if driving.is_faultless:
         return motion
     turns = np.diag(space.diagonal(1.0, 0.0)) > 0
     scale = np.where(turns, driving.turn_scale, driving.distance_scale)
-    return Motion(space.expmap(space.logmap(motion.pose) / scale), motion.covariance / scale[:, None] / scale)
+    told = space.logmap(motion.pose)
+    twist = told / scale
+    if driving.distance_per_radian:
+        meters, lost = _size(twist[~turns]), driving.distance_per_radian * _size(told[turns])
+        twist[~turns] *= max(0.0, 1 - lost / max(meters, TINY))
+    if driving.turn_per_meter:
+        twist[np.flatnonzero(turns)[-1]] -= driving.turn_per_meter * twist[np.flatnonzero(~turns)[0]]
+    return Motion(space.expmap(twist), motion.covariance / scale[:, None] / scale)
+
+
+def _size(vector: Array) -> float:
+    return float(np.linalg.norm(vector))
 
 
 def _weight(factor: Any, values: gtsam.Values) -> float:

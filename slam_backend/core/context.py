@@ -19,15 +19,24 @@ from .space import Space
 class Correction:
     """The constants of a source, as configured or as calibrated.
 
-    range_scale, distance_scale, turn_scale: how many times too large. time_offset: s to add to its stamps. mount:
-    `frame_T_true`, of the sensor's frame; None: it sits where it is said to.
+    range_scale, distance_scale, turn_scale: how many times too large. distance_per_radian: m too many for each rad turned.
+    turn_per_meter: rad too many to the left for each m ahead. time_offset: s to add to its stamps. mount: `frame_T_true`, of the
+    sensor's frame; None: it sits where it is said to.
     """
 
     range_scale: float = 1.0
     distance_scale: float = 1.0
     turn_scale: float = 1.0
+    distance_per_radian: float = 0.0
+    turn_per_meter: float = 0.0
     time_offset: float = 0.0
     mount: Pose | None = None
+
+    @property
+    def is_faultless(self) -> bool:
+        """Whether an odometry's motions are as told."""
+        exact = self.distance_scale == self.turn_scale == 1.0
+        return exact and self.distance_per_radian == self.turn_per_meter == 0.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -85,8 +85,8 @@ def test_the_map_is_better_for_it(long, found_out, believed):
     assert error(found_out) < 0.6 * error(believed)
 
 
-def scaled(simulation, distance, turn):
-    """The drive with odometry that tells every step so many times too long and too sharp."""
+def faulty(simulation, twisted):
+    """The drive with odometry that tells of every step another twist (x, y, yaw) than it was."""
     from slam_backend.core.space import SPACES
 
     space = SPACES["2d"]
@@ -95,9 +95,7 @@ def scaled(simulation, distance, turn):
         if isinstance(item, OdometryPose):
             here = space.pose(item.pose.tolist())
             if last is not None:
-                pose = pose.compose(
-                    space.expmap(space.logmap(last.between(here)) * (distance, distance, turn))
-                )
+                pose = pose.compose(space.expmap(twisted(space.logmap(last.between(here)))))
             last = here
             yield replace(item, pose=frozen(space.seven(pose)))
         else:
@@ -106,11 +104,27 @@ def scaled(simulation, distance, turn):
 
 def test_odometry_that_tells_too_much_is_found_out_by_landmarks():
     simulation = drive(sigma_rotation_per_meter=0.001, sigma_rotation_per_radian=0.002)
-    items = list(scaled(simulation, 1.04, 1.07))
+    items = list(faulty(simulation, lambda twist: twist * (1.04, 1.04, 1.07)))
     found = run(simulation, items, wheels=["distance_scale", "turn_scale"]).calibration.found["wheels"]
     assert abs(off(found["distance_scale"], 1.04)) < 3.5
     assert abs(off(found["turn_scale"], 1.07)) < 3.5
     assert found["distance_scale"].sigma < 0.01
+
+
+def test_wheels_that_lose_way_in_turns_and_draw_to_one_side_are_found_out_by_landmarks():
+    """Bearings and ranges tell both without the size of the map being known otherwise."""
+    simulation = drive(sigma_rotation_per_meter=0.001, sigma_rotation_per_radian=0.002)
+
+    def twisted(twist):
+        x, y, yaw = twist
+        return np.array([x + 0.1 * abs(yaw + 0.02 * x), y, yaw + 0.02 * x])
+
+    names = ["distance_per_radian", "turn_per_meter"]
+    found = run(simulation, list(faulty(simulation, twisted)), wheels=names).calibration.found["wheels"]
+    assert abs(off(found["distance_per_radian"], 0.1)) < 3.5
+    assert abs(off(found["turn_per_meter"], 0.02)) < 3.5
+    assert found["distance_per_radian"].sigma < 0.05
+    assert found["turn_per_meter"].sigma < 0.005
 
 
 def test_a_clock_that_is_late_and_a_mounting_that_is_wrong_are_found_out():
@@ -160,24 +174,39 @@ def test_only_the_odometry_that_drives_can_be_calibrated():
         Backend(config_from({"sources": ["a", "b"], **two}))
 
 
-def test_constants_that_are_known_are_said_in_the_configuration():
-    """A scale of the driving odometry, without any estimate."""
-    wheels = {"kind": "odometry", "distance_scale": 2.0}
+@pytest.mark.parametrize(
+    ("space", "known", "told", "true"),
+    [
+        ("2d", {"distance_scale": 2.0}, (1, 0), (0.5, 0)),
+        ("2d", {"turn_per_meter": 0.1}, (2, 0.5), (2, 0.3)),
+        ("3d", {"turn_per_meter": 0.1}, (-2, 0.5), (-2, 0.7)),
+        ("2d", {"distance_per_radian": 0.4}, (1, 0.5), (0.8, 0.5)),
+        ("3d", {"distance_per_radian": 0.4}, (-1, -0.5), (-0.8, -0.5)),
+        ("2d", {"distance_per_radian": 4.0}, (1, 0.5), (0, 0.5)),
+        ("2d", {"distance_per_radian": 4.0}, (0, 0.5), (0, 0.5)),
+    ],
+)
+def test_constants_that_are_known_are_said_in_the_configuration(space, known, told, true):
+    """Of the driving odometry, without any estimate: (m ahead, rad to the left) along an arc, as told and as it was. What is lost in a
+    turn is at most the whole way.
+    """
+    from slam_backend.core.space import SPACES
+
+    wheels = {"kind": "odometry", **known}
+    keyframes = {"every": True}
     backend = Backend(
-        config_from({"space": "2d", "keyframes": {"every": True}, "sources": ["wheels"], "wheels": wheels})
+        config_from({"space": space, "keyframes": keyframes, "sources": ["wheels"], "wheels": wheels})
     )
-    for second, x in ((1, 0.0), (2, 1.0)):
-        still = frozen(np.zeros(36))
+
+    def arc(meters, radians):
+        return SPACES["2d"].expmap(np.array([meters, 0.0, radians]))
+
+    for second, twist in ((1, (0.0, 0.0)), (2, told)):
+        zeros = frozen(np.zeros(36))
+        seven = frozen(SPACES["2d"].seven(arc(*twist)))
         backend.add(
-            OdometryPose(
-                second * SECOND,
-                "wheels",
-                "odom",
-                "base",
-                frozen([x, 0, 0, 0, 0, 0, 1]),
-                still,
-                frozen(np.zeros(6)),
-                still,
-            )
+            OdometryPose(second * SECOND, "wheels", "odom", "base", seven, zeros, frozen(np.zeros(6)), zeros)
         )
-    np.testing.assert_allclose(backend.snapshot().poses[1, :3, 3], [0.5, 0, 0], atol=1e-6)
+    here = backend.snapshot().poses[1]
+    np.testing.assert_allclose(here[:2, 3], arc(*true).translation(), atol=1e-6)
+    np.testing.assert_allclose(np.arctan2(here[1, 0], here[0, 0]), true[1], atol=1e-6)

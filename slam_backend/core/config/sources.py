@@ -85,9 +85,21 @@ class OdometrySource(Source):
     turn_scale: float = Field(
         1.0, gt=0.1, lt=10, description="how many times too large its turns are; of the one that drives"
     )
-    calibrate: tuple[Literal["distance_scale", "turn_scale"], ...] = Field(
-        (), description="constants that are estimated with the map; of the one that drives"
+    distance_per_radian: float = Field(
+        0.0,
+        ge=-10,
+        le=10,
+        description="m that it tells too many for each rad turned, either way (wheels that slip or lag in turns); of the one that drives",
     )
+    turn_per_meter: float = Field(
+        0.0,
+        ge=-10,
+        le=10,
+        description="rad that it turns too far to the left for each m ahead (unequal wheels); of the one that drives",
+    )
+    calibrate: tuple[
+        Literal["distance_scale", "turn_scale", "distance_per_radian", "turn_per_meter"], ...
+    ] = Field((), description="constants that are estimated with the map; of the one that drives")
     max_speed: float = Field(100.0, gt=0, description="m/s; a faster step is a teleport and is refused")
     sigma_acceleration: float = Field(
         1.0,
@@ -168,6 +180,12 @@ class LandmarkSource(Mounted):
         0.1, gt=0, le=1e6, description="rad, for the orientation of tags without noise of their own"
     )
     sigma_range: float = Field(0.1, gt=0, le=1e6, description="m, for ranges without noise of their own")
+    sigma_range_per_meter: float = Field(
+        0.0,
+        ge=0,
+        le=10,
+        description="of the range, likewise: 0.02 for a sensor that is good to 2 %; variances add, with that of sigma_range",
+    )
     sigma_bearing: float = Field(
         0.02, gt=0, le=1e6, description="rad, for bearings without noise of their own"
     )

@@ -384,7 +384,8 @@ def moved(point: Array, covariance: Array, mount: Pose, motion: Motion | None) -
 def _in_space(m: LandmarkObservation, context: Context, config: LandmarkSource) -> tuple[Array, Array]:
     """The value and covariance without the axes that the space lacks, zeros and NaN replaced by the defaults, ranges to scale."""
     keep, scale = _axes(m.form, context.space), context.correction.range_scale
-    bearing, span = config.sigma_bearing**2, config.sigma_range**2
+    bearing = config.sigma_bearing**2
+    span = config.sigma_range**2 + (config.sigma_range_per_meter * float(m.value[-1])) ** 2
     defaults = {
         "position": (config.sigma_position**2,) * 3,
         "bearing_range": (bearing, bearing, span),

@@ -225,6 +225,17 @@ def test_noise_that_is_not_stated_is_the_configured_one(world, offered, form):
     np.testing.assert_allclose(default, explicit, rtol=1e-9)
 
 
+@pytest.mark.parametrize("form", ["bearing_range", "range"])
+def test_noise_of_a_range_may_grow_with_it(world, offered, form):
+    """As data sheets have it: centimetres and per cent, as variances."""
+    config = LandmarkSource(sigma_range=0.03, sigma_range_per_meter=0.02)
+    size = len(SIGMAS[form])
+    seen = sighting(world, form, "", AT_KEYFRAME, np.full((size, size), np.nan))
+    (made,) = factors(offered(seen), None, None, world.context(), config).add
+    sigma = np.hypot(0.03, 0.02 * seen.value[-1])
+    assert abs(made.factor.noiseModel().R()[-1, -1]) == pytest.approx(1 / sigma, rel=1e-6)
+
+
 def test_the_kernel_of_the_source_is_around_the_noise(world, offered):
     seen = sighting(world, "position", "", AT_KEYFRAME, np.full((3, 3), np.nan))
     (made,) = factors(offered(seen), None, None, world.context(), LandmarkSource(kernel="cauchy")).add
