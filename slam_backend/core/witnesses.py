@@ -53,9 +53,7 @@ def _by_motion(one: Factor, other: Factor, two: Parted, paths: Paths) -> int:
 def _by_others(two: Parted, paths: Paths, factors: Iterable[Factor], fits: Callable[[Factor], bool]) -> bool:
     seen = two.places.factors
     there = [factor for factor, first in zip(seen, two.first, strict=True) if not first]
-    known = seen[
-        int(np.argmin(two.first)) - 1
-    ].stamp  # the last sighting of the one before the first of the other
+    known = seen[int(np.argmin(two.first)) - 1].stamp  # of the last sighting before the second place was seen
     before, again = set[int](), set[int]()
     beside: dict[int, bool] = {factor.keys[0]: True for factor in there}
     for factor in factors:
