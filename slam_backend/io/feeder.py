@@ -47,6 +47,15 @@ class _Worker:
         self.finishing = self.gone = False
         self.failure = ""
 
+    @property
+    def progress(self) -> tuple[int, str]:
+        """Other than before if it gets on: rows read, and CPU time used, since to save a large map takes minutes without a row."""
+        try:
+            words = Path(f"/proc/{self.process.pid}/stat").read_text(encoding="ascii", errors="replace")
+        except OSError:  # it is gone, or this is no Linux
+            return self.applied, ""
+        return self.applied, " ".join(words.rpartition(")")[2].split()[11:13])
+
     def end(self, patience: float = 0.0) -> None:
         """After at most `patience` s there is no process any more."""
         self.process.join(patience)
@@ -134,24 +143,24 @@ class Feeder:
         return answer.content
 
     def _awaited(self, request: Request, timeout: float) -> Answer | None:
-        """None if it did not come in time (s). As long as the worker reads on, the last one has time."""
+        """None if it did not come in time (s). As long as the worker gets on, the last one has time."""
 
         def over() -> bool:
             return self._answers[request.id] is not None or self._stop.is_set()
 
         with self._answered:
             while True:
-                applied = self._worker.applied
+                before = self._worker.progress
                 if self._answered.wait_for(over, timeout) or request is not self._last:
                     break
-                if self._worker.applied == applied:
+                if self._worker.progress == before:
                     break
             return self._answers.pop(request.id)
 
     def finish(self, folder: str, timeout: float) -> Any:
         """Feed what is left of the journal, flush, save the run at `folder`, end the worker; the run's summary.
 
-        SlamError if the worker comes no further for so long (s). One that dies meanwhile gets a successor.
+        SlamError if the worker comes no further for so long (s), nor computes. One that dies meanwhile gets a successor.
         """
         self.held = None
         try:

@@ -203,6 +203,23 @@ def test_a_stopped_worker_bounds_the_farewell(stage, drive) -> None:
     assert time.monotonic() - begin < 2
 
 
+def test_a_worker_that_computes_gets_on_and_one_that_is_stopped_does_not(stage, drive) -> None:
+    """To write a large map takes long, and no row is read meanwhile: the farewell waits as long as this goes on."""
+    stage.append(drive[1])
+    stage.until(stage.has_read(len(drive[1])))
+    read = stage.feeder._worker.progress
+    for n in range(5):
+        stage.feeder.request("save", str(stage.folder / f"save{n}"))
+    saved = stage.feeder._worker.progress
+    assert saved[0] == read[0]
+    assert saved[1] != read[1]
+    os.kill(stage.feeder.pid, signal.SIGSTOP)
+    time.sleep(0.1)
+    stopped = stage.feeder._worker.progress
+    time.sleep(0.3)
+    assert stage.feeder._worker.progress == stopped
+
+
 def test_paused_it_keeps_records_and_answers(stage, drive) -> None:
     _, records, summary, _ = drive
     stage.append(records[:200])

@@ -124,7 +124,7 @@ def _covariance(table: dict[str, Array], n: int, axes: tuple[str, ...]) -> Array
             if name in table:
                 sigmas[k] = table[name][n]
                 break
-    return np.diag(sigmas**2)
+    return np.diag(sigmas * np.abs(sigmas))  # one below zero stays so, and is refused
 
 
 def decode_range(message: Message, source: str) -> Iterable[LandmarkObservation]:

@@ -100,7 +100,7 @@ def _covariance(table: dict[str, Array], n: int) -> Array:
             if name in table:
                 sigmas[k] = table[name][n]
                 break
-    return np.diag(sigmas**2).reshape(36)
+    return np.diag(sigmas * np.abs(sigmas)).reshape(36)  # one below zero stays so, and is refused
 
 
 DECODERS: Mapping[str, Decoder] = {

@@ -334,6 +334,12 @@ def cloud(stamp=(3, 5), frame="mast", **columns) -> SimpleNamespace:
     )  # fmt: skip
 
 
+def test_a_sigma_below_zero_is_no_variance():
+    """It must not become that of its size: the firewall refuses it."""
+    (point,) = decode_points(cloud(id=[1], x=[1.0], y=[2.0], z=[3.0], sigma_z=[-0.5], sigma=[0.1]), "trees")
+    assert np.diag(point.covariance).tolist() == pytest.approx([0.01, 0.01, -0.25])
+
+
 def test_positions_ids_and_sigmas_are_read_by_field_name():
     message = cloud(
         frame="/mast",
