@@ -157,7 +157,10 @@ class Drive:
         """What the IMU measured since the newest keyframe."""
         books = self._books
         if self._inertial is not None:
-            books.stretch = self._inertial.cut(stamp)
+            turned = None
+            if not self._by_imu and books.newest is not None:
+                turned = books.space.size(books.newest[1].between(books.track.pose(stamp)))[1]
+            books.stretch = self._inertial.cut(stamp, turned)
             books.decisions += self._inertial.take_decisions()
         return books.stretch
 

@@ -32,6 +32,8 @@ STRAIGHT = 1e-3  # relative change of a slope that is only rounding
 ENOUGH = 5  # samples, to tell by their looks whether the robot stands still
 ODD = 0.5  # of gravity: what the first samples may differ from it
 SIDEWAYS = 0.8  # rad: a robot is not tilted so much where it starts; an IMU whose mounting nobody told is
+TURN, TURNS = 0.05, 10  # rad by the odometry that count as a turn; turns that fit until no more are looked at
+DEGREES = 20.0  # times as far as the odometry: 57 are expected of rates in degrees per second
 UNMEASURED = 3.0, 0.5  # m/s^2, rad/s: how the robot may have moved while its IMU did not tell
 GUESSED = 0.1  # m/s: of the velocity, in the covariance of a motion that is told without its velocity
 UNIT3, UNIT6 = np.eye(3), np.eye(6)  # asked for at every keyframe
@@ -125,6 +127,7 @@ class Inertial:
         self._measured: gtsam.PreintegratedCombinedMeasurements | None = None  # since then
         self._at = 0  # stamp up to which it goes
         self._flaw = ""
+        self._in_degrees, self._trusted = False, 0  # turns in a row that have fitted the odometry's
         self._bias = Bias()  # last believed
         self._up, self._slope = 0.0, 0.0  # vertical acceleration of the newest sample; its change per ns
         self._straight = 0  # ns for which that has been the same
@@ -201,8 +204,8 @@ class Inertial:
 
     # -- keyframes -------------------------------------------------------------------------------
 
-    def cut(self, stamp: int) -> Stretch | None:
-        """From the newest keyframe to this stamp. None where the IMU tells nothing there."""
+    def cut(self, stamp: int, turned: float | None = None) -> Stretch | None:
+        """From the newest keyframe to this stamp. None where the IMU tells nothing there. turned: rad, by the odometry."""
         if not self._is_alive(stamp):
             self._fall_silent(stamp)
             return None
@@ -211,11 +214,25 @@ class Inertial:
         if stamp < self._at:
             self._begin_again(stamp)
         self._integrate(stamp)
+        if turned is not None and self._trusted < TURNS:
+            self._compare_turns(stamp, turned)
         if self._flaw:
             start = stamp if self._start is None else self._start.stamp
             self._decide(stamp, "refused", self._flaw, (stamp - start) / SECOND)
         assert self._measured is not None
         return Stretch(self._start, self.predicted, self._measured, self._flaw)
+
+    def _compare_turns(self, stamp: int, turned: float) -> None:
+        """Rates in degrees per second show where the robot turns. They are not used until a turn fits."""
+        if turned >= TURN and self._start is not None:
+            since = bisect_right(self._samples, self._start.stamp, key=attrgetter("stamp"))
+            rates = [sample.rate for sample in self._samples[since:]]
+            mean = np.mean(rates, axis=0) if rates else np.zeros(3)
+            seconds = (stamp - self._start.stamp) / SECOND
+            self._in_degrees = float(np.linalg.norm(mean)) * seconds > DEGREES * turned
+            self._trusted = 0 if self._in_degrees else self._trusted + 1
+        if self._in_degrees:
+            self._flaw = "imu/degrees"
 
     def begin(self, state: State | None, stamp: int) -> None:
         """A keyframe is there. state: what is believed of it; None if it has no velocity and bias."""

@@ -132,6 +132,10 @@ RULES: Mapping[str, Rule] = {
         "error", "at the start the mean acceleration is nothing like gravity",
         "accelerations must be in m/s^2 and include gravity (at rest 9.81 upwards)", unit="m/s^2", setting="<imu>.gravity",
     ),
+    "imu/degrees": Rule(
+        "error", "the gyroscope turns tens of times as far as the odometry: rates in degrees per second? The stretch is not used",
+        "angular_velocity must be in rad/s", unit="s",
+    ),
     "imu/sideways": Rule(
         "warn", "gravity says that the robot lies on its side: is the IMU mounted so?",
         "tell its mounting: add its frame to 'extrinsics' or send it on /tf_static", unit="rad",

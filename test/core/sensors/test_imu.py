@@ -291,6 +291,23 @@ def test_accelerations_in_g_or_without_gravity_are_refused(scale):
     assert not [each for each in backend.solver.factors.values() if each.kind == "imu"]
 
 
+def test_rates_in_degrees_per_second_are_refused_as_soon_as_the_robot_turns():
+    flight = Flight(0)
+    samples = [replace(each, rate=frozen(np.degrees(each.rate))) for each in flight.samples]
+    backend, decisions = run(config("wheels", keyframes={"every": True}), samples, flight.odometry())
+    told = [each for each in decisions if each.reason == "degrees"]
+    assert {each.verdict for each in told} == {"refused"}
+    factors = [each.factor for each in backend.solver.factors.values()]
+    assert not [each for each in factors if isinstance(each, gtsam.CombinedImuFactor)]
+    assert (
+        len(told) == len(backend.timeline) - 2
+    )  # of a spiral each step is a turn; the IMU begins with the second keyframe
+    right, decisions = run(config("wheels", keyframes={"every": True}), flight.samples, flight.odometry())
+    assert "imu/degrees" not in rules(decisions)
+    ends = [each.snapshot().at(np.array(flight.stamps[-1:]))[0, :3] for each in (backend, right)]
+    assert np.abs(ends[0] - ends[1]).max() < 0.5
+
+
 def test_an_imu_on_its_side_is_noticed():
     flight = Flight(0)
     samples = [
