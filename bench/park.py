@@ -99,8 +99,12 @@ def _bare_loop(steps: dict[int, Any], seen: dict[int, list[tuple[int, float, flo
     isam.calculateBestEstimate()
 
 
-def parameters() -> gtsam.ISAM2Params:
-    defaults, params, descent = Config().isam2, gtsam.ISAM2Params(), gtsam.ISAM2GaussNewtonParams()
+def parameters(config: Config | None = None) -> gtsam.ISAM2Params:
+    defaults, params, descent = (
+        (config or Config()).isam2,
+        gtsam.ISAM2Params(),
+        gtsam.ISAM2GaussNewtonParams(),
+    )
     params.setRelinearizeThreshold(defaults.relinearize_threshold)
     params.relinearizeSkip = defaults.relinearize_skip
     params.enablePartialRelinearizationCheck = True
