@@ -21,8 +21,8 @@ from bench.table import Row
 from slam_backend.core.backend import Backend
 from slam_backend.core.config import Config
 from slam_backend.core.graph import Decision, Delta, Factor, total
-from slam_backend.core.inertial import ImuSample, imu_of, parameters
-from slam_backend.core.measurement import SECOND, Array, Measurement, StaticTransform
+from slam_backend.core.inertial import imu_of, parameters
+from slam_backend.core.measurement import SECOND, Array, ImuSample, Measurement, StaticTransform
 from slam_backend.core.mounts import Mounts
 from slam_backend.core.sensors.pixels import PixelFrame
 from slam_backend.core.solvers.isam2 import JOINING

@@ -25,8 +25,7 @@ from .firewall.repeats import Repeats
 from .firewall.rules import Fault, decided
 from .firewall.values import judge_fix, judge_pose, judge_sample, judge_sighting, judge_stamps
 from .graph import Decision
-from .inertial import ImuSample
-from .measurement import SECOND, Measurement, StaticTransform
+from .measurement import SECOND, ImuSample, Measurement, StaticTransform
 from .sensors.gnss import Fix
 from .sensors.landmark import LandmarkObservation
 from .sensors.odometry import OdometryPose

@@ -12,9 +12,9 @@ from .config import GnssSource, OdometrySource, PoseSource
 from .context import Unusable, unknown_frame
 from .graph import Delta, Factor, Keyframe, Offer, identify
 from .growth import TILT, Growth
-from .inertial import ImuSample, Inertial, Stretch, imu_of, pace_from
+from .inertial import Inertial, Stretch, imu_of, pace_from
 from .keyframes import due
-from .measurement import SECOND, Measurement
+from .measurement import SECOND, ImuSample, Measurement
 from .sensing import Sensing
 from .sensors.gnss import Fix
 from .sensors.odometry import HERE, OdometryPose, stated

@@ -16,7 +16,8 @@ import numpy as np
 from .config import Config, ImuNoise, ImuSource, Keyframes
 from .firewall.rules import decided
 from .graph import Decision, Motion, Pose, Verdict
-from .measurement import SECOND, Array, Measurement
+from .measurement import SECOND, Array, ImuSample, Measurement
+from .symptoms import Symptoms
 
 Bias = gtsam.imuBias.ConstantBias
 
@@ -27,30 +28,12 @@ INTEGRATION = (
 PERIOD = 0.01  # s between samples, before two of them have told
 STILL_RATE, STILL_ACCELERATION = 0.006, 0.06  # rad/s, m/s^2: largest standard deviations of an IMU at rest
 LARGEST_BIAS = 0.1  # rad/s: a mean rate that may still be the bias of an IMU at rest
-STUCK = SECOND  # ns of the very same numbers that no IMU tells by itself: a real one has noise
-STRAIGHT = 1e-3  # relative change of a slope that is only rounding
 ENOUGH = 5  # samples, to tell by their looks whether the robot stands still
 ODD = 0.5  # of gravity: what the first samples may differ from it
 SIDEWAYS = 0.8  # rad: a robot is not tilted so much where it starts; an IMU whose mounting nobody told is
-TURN, TURNS = 0.05, 10  # rad by the odometry that count as a turn; turns that fit until no more are looked at
-DEGREES = 20.0  # times as far as the odometry: 57 are expected of rates in degrees per second
 UNMEASURED = 3.0, 0.5  # m/s^2, rad/s: how the robot may have moved while its IMU did not tell
 GUESSED = 0.1  # m/s: of the velocity, in the covariance of a motion that is told without its velocity
 UNIT3, UNIT6 = np.eye(3), np.eye(6)  # asked for at every keyframe
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class ImuSample(Measurement):
-    """rate: (3,) rad/s, acceleration: (3,) m/s^2, gravity included (at rest it points up); both in the sensor's frame.
-
-    Covariances: (9,) of one sample, row by row; zeros, or -1 at the first place, where the message has none.
-    """
-
-    frame: str
-    rate: Array
-    acceleration: Array
-    rate_covariance: Array
-    acceleration_covariance: Array
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -108,9 +91,7 @@ class Inertial:
     def __init__(self, source: str, config: ImuSource) -> None:
         self._source, self._config, self._stated = source, config, config.stated
         self._longest = config.max_gap * SECOND  # ns
-        self._ends = (
-            config.max_rate is not None or config.max_acceleration is not None
-        )  # it says where its range does
+        self._symptoms = Symptoms(config)
         self._samples: list[
             ImuSample
         ] = []  # since the newest keyframe; before the first, of the last seconds
@@ -127,11 +108,7 @@ class Inertial:
         self._measured: gtsam.PreintegratedCombinedMeasurements | None = None  # since then
         self._at = 0  # stamp up to which it goes
         self._flaw = ""
-        self._in_degrees, self._trusted = False, 0  # turns in a row that have fitted the odometry's
         self._bias = Bias()  # last believed
-        self._up, self._slope = 0.0, 0.0  # vertical acceleration of the newest sample; its change per ns
-        self._straight = 0  # ns for which that has been the same
-        self._same: int | None = 0  # ns for which nothing has changed; None once that has been told
         self._period = PERIOD  # s between the newest two samples
         self._decisions: list[Decision] = []
 
@@ -147,31 +124,17 @@ class Inertial:
             self._mount, self._params = mount, None
         if self._from is None:
             self._collect(sample)
-        self._compare(sample, self._newest or sample)
+        before = self._newest or sample
+        if 0 < (elapsed := sample.stamp - before.stamp) <= self._longest:
+            self._period = elapsed / SECOND
+        if (stuck := self._symptoms.compare(sample, before)) is not None:
+            self._decide(sample.stamp, "accepted", "imu/stuck", stuck)
         self._newest = sample
         self._samples.append(sample)
         if len(self._samples) > KEPT:
             self._integrate(self._samples[KEPT // 2].stamp)
             self._drop(KEPT // 2)
             self._cuttable = self._at
-
-    def _compare(self, sample: ImuSample, before: ImuSample) -> None:
-        """How far apart samples are, and for how long (ns) they have been lying on a straight line that is not level: somebody
-        filled a gap with them.
-        """
-        elapsed, last, up = sample.stamp - before.stamp, self._slope, sample.acceleration.item(2)
-        if 0 < elapsed <= self._longest:
-            self._period = elapsed / SECOND
-        self._slope = slope = (up - self._up) / elapsed if elapsed > 0 else 0.0
-        self._up = up
-        on = slope != 0 and abs(slope - last) <= STRAIGHT * abs(slope)
-        self._straight = self._straight + elapsed if on else 0
-        if self._same is not None:
-            stuck = slope == 0 and elapsed > 0 and _are_alike(sample, before)
-            self._same = self._same + elapsed if stuck else 0
-            if self._same > STUCK:
-                self._decide(sample.stamp, "accepted", "imu/stuck", self._same / SECOND)
-                self._same = None
 
     def _collect(self, sample: ImuSample) -> None:
         """Before the first keyframe: the samples of the last seconds, without a gap between them."""
@@ -214,7 +177,7 @@ class Inertial:
         if stamp < self._at:
             self._begin_again(stamp)
         self._integrate(stamp)
-        if turned is not None and self._trusted < TURNS:
+        if turned is not None and self._symptoms.doubts_turns:
             self._compare_turns(stamp, turned)
         if self._flaw:
             start = stamp if self._start is None else self._start.stamp
@@ -223,15 +186,11 @@ class Inertial:
         return Stretch(self._start, self.predicted, self._measured, self._flaw)
 
     def _compare_turns(self, stamp: int, turned: float) -> None:
-        """Rates in degrees per second show where the robot turns. They are not used until a turn fits."""
-        if turned >= TURN and self._start is not None:
+        if self._start is not None:
             since = bisect_right(self._samples, self._start.stamp, key=attrgetter("stamp"))
             rates = [sample.rate for sample in self._samples[since:]]
-            mean = np.mean(rates, axis=0) if rates else np.zeros(3)
-            seconds = (stamp - self._start.stamp) / SECOND
-            self._in_degrees = float(np.linalg.norm(mean)) * seconds > DEGREES * turned
-            self._trusted = 0 if self._in_degrees else self._trusted + 1
-        if self._in_degrees:
+            self._symptoms.compare_turns(rates, (stamp - self._start.stamp) / SECOND, turned)
+        if self._symptoms.in_degrees:
             self._flaw = "imu/degrees"
 
     def begin(self, state: State | None, stamp: int) -> None:
@@ -294,10 +253,7 @@ class Inertial:
         if max(sample.stamp - before.stamp, until - sample.stamp) > self._longest:
             self._coast(until)
         elif seconds > 0:
-            if self._ends and self._is_saturated(sample):
-                self._flaw = "imu/saturated"
-            if self._straight > self._longest:
-                self._flaw = "imu/interpolated"
+            self._flaw = self._symptoms.flaw(sample) or self._flaw
             assert self._measured is not None
             self._measured.integrateMeasurement(sample.acceleration, sample.rate, seconds)
             self._at = until
@@ -315,12 +271,6 @@ class Inertial:
         self._from = State(until, pose, state.velocity, state.bias)
         self._at, self._flaw = until, "imu/gap"
         self._renew(self._from)
-
-    def _is_saturated(self, sample: ImuSample) -> bool:
-        rate, acceleration = self._config.max_rate, self._config.max_acceleration
-        return (rate is not None and max(map(abs, sample.rate.tolist())) >= rate) or (
-            acceleration is not None and max(map(abs, sample.acceleration.tolist())) >= acceleration
-        )
 
     def _begin_again(self, stamp: int) -> None:
         """For a keyframe in the past: from the newest one on."""
@@ -400,11 +350,6 @@ class Inertial:
         self, stamp: int, verdict: Verdict, rule: str, statistic: float, threshold: float | None = None
     ) -> None:
         self._decisions.append(decided(Measurement(stamp, self._source), verdict, rule, statistic, threshold))
-
-
-def _are_alike(one: ImuSample, other: ImuSample) -> bool:
-    """Whether all six numbers are the same, to the last bit."""
-    return np.array_equal(one.acceleration, other.acceleration) and np.array_equal(one.rate, other.rate)
 
 
 def parameters(config: ImuSource, noise: ImuNoise, mount: Pose | None) -> gtsam.PreintegrationCombinedParams:

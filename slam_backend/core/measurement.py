@@ -90,3 +90,17 @@ def parse_frame(text: str) -> tuple[str, int | None]:
 
 
 Decoder = Callable[[Message, str], Measurement | Iterable[Measurement]]  # (message, source)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ImuSample(Measurement):
+    """rate: (3,) rad/s, acceleration: (3,) m/s^2, gravity included (at rest it points up); both in the sensor's frame.
+
+    Covariances: (9,) of one sample, row by row; zeros, or -1 at the first place, where the message has none.
+    """
+
+    frame: str
+    rate: Array
+    acceleration: Array
+    rate_covariance: Array
+    acceleration_covariance: Array

@@ -18,8 +18,7 @@ from ..core import command
 from ..core.errors import BadMessage
 from ..core.firewall.rules import OVERSIZE, RULES
 from ..core.graph import Decision
-from ..core.inertial import ImuSample
-from ..core.measurement import SECOND, Array, Measurement, parse_frame
+from ..core.measurement import SECOND, Array, ImuSample, Measurement, parse_frame
 from ..core.sensors import SENSORS
 from ..core.sensors.odometry import STILL, UNKNOWN, OdometryPose
 from ..core.sensors.relative import RelativePose

@@ -8,8 +8,8 @@ import numpy as np
 
 from ..core.config import Config, ImuSource
 from ..core.firewall.rules import RULES
-from ..core.inertial import ODD, SIDEWAYS, ImuSample
-from ..core.measurement import StaticTransform
+from ..core.inertial import ODD, SIDEWAYS
+from ..core.measurement import ImuSample, StaticTransform
 from ..core.mounts import Mounts
 from ..core.sensors.imu import DECODERS
 from ..core.space import SPACES

@@ -5,8 +5,7 @@ from typing import NamedTuple
 
 from numpy.random import Generator
 
-from ..core.inertial import ImuSample
-from ..core.measurement import SECOND, Measurement
+from ..core.measurement import SECOND, ImuSample, Measurement
 from ..core.sensors.gnss import Fix
 from ..core.sensors.landmark import LandmarkObservation
 from ..core.sensors.odometry import OdometryPose

@@ -7,8 +7,7 @@ import numpy as np
 from numpy.random import Generator
 
 from ..core.geometry import inverse_of
-from ..core.inertial import ImuSample
-from ..core.measurement import SECOND, Array, frozen
+from ..core.measurement import SECOND, Array, ImuSample, frozen
 from .options import Options
 from .world import exp_of
 

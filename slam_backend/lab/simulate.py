@@ -15,8 +15,7 @@ from numpy.typing import NDArray
 from ..core.config import config_from
 from ..core.errors import BadConfig
 from ..core.geometry import inverse_of, seven_of_matrix
-from ..core.inertial import ImuSample
-from ..core.measurement import SECOND, Array, Measurement, format_stamp, frozen
+from ..core.measurement import SECOND, Array, ImuSample, Measurement, format_stamp, frozen
 from ..core.sensors.gnss import Fix
 from ..core.sensors.odometry import STILL, UNKNOWN, OdometryPose
 from ..core.sensors.pixels import PixelFrame

@@ -5,8 +5,7 @@ from typing import Any, Protocol
 
 from ..core.check import checked
 from ..core.config import Config
-from ..core.inertial import ImuSample
-from ..core.measurement import SECOND, StaticTransform
+from ..core.measurement import SECOND, ImuSample, StaticTransform
 from ..core.sensors.odometry import TRANSFORMS, OdometryPose
 from ..io.cdr import Decoder, header_stamp
 from ..io.inputs import TF_STATIC

@@ -1,8 +1,7 @@
 """~/odometry: where the robot is in the map, at once, at the rate of the odometry or of an IMU; never waits for the solver."""
 
 from ..core.config import Config
-from ..core.inertial import ImuSample
-from ..core.measurement import StaticTransform
+from ..core.measurement import ImuSample, StaticTransform
 from ..core.sensors.odometry import OdometryPose
 from .intake import Flowing
 from .outputs import Outputs

@@ -9,8 +9,8 @@ import numpy as np
 from ..core.backend import Update
 from ..core.config import Config
 from ..core.graph import Motion, Pose
-from ..core.inertial import ImuSample, Inertial, State, imu_of
-from ..core.measurement import SECOND, Array, StaticTransform
+from ..core.inertial import Inertial, State, imu_of
+from ..core.measurement import SECOND, Array, ImuSample, StaticTransform
 from ..core.mounts import Mounts
 from ..core.space import SPACES
 from .pose import UNKNOWN

@@ -5,8 +5,7 @@ import pytest
 from slam_backend.core.backend import Backend
 from slam_backend.core.config import GnssSource, config_from
 from slam_backend.core.fixes import Fixes
-from slam_backend.core.inertial import ImuSample
-from slam_backend.core.measurement import SECOND, frozen
+from slam_backend.core.measurement import SECOND, ImuSample, frozen
 from slam_backend.core.sensors.gnss import Fix
 
 ZERO = frozen((0.0,) * 9)

@@ -6,7 +6,7 @@ import pytest
 
 from slam_backend.core.errors import BadConfig
 from slam_backend.core.geometry import matrix_of
-from slam_backend.core.inertial import ImuSample
+from slam_backend.core.measurement import ImuSample
 from slam_backend.io.cdr import Decoder
 from slam_backend.io.typestore import typestore_of
 from slam_backend.lab.inertia import erring, felt, velocities

@@ -7,8 +7,7 @@ import yaml
 from slam_backend.core.backend import Backend
 from slam_backend.core.config import config_from
 from slam_backend.core.geometry import matrix_of
-from slam_backend.core.inertial import ImuSample
-from slam_backend.core.measurement import SECOND, StaticTransform, frozen
+from slam_backend.core.measurement import SECOND, ImuSample, StaticTransform, frozen
 from slam_backend.lab.simulate import Options, simulate
 from slam_backend.ros.propagation import Propagator
 

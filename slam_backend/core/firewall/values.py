@@ -4,8 +4,7 @@ from math import isfinite
 
 import numpy as np
 
-from ..inertial import ImuSample
-from ..measurement import SECOND, Array
+from ..measurement import SECOND, Array, ImuSample
 from ..sensors.gnss import Fix
 from ..sensors.landmark import FORMS, LandmarkObservation, used_axes
 from ..space import Space

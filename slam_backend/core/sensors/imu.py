@@ -14,8 +14,8 @@ from gtsam.symbol_shorthand import B, V
 from ..config import ImuNoise, ImuSource
 from ..context import Context
 from ..graph import Delta, Factor, Keyframe, Motion, Offer
-from ..inertial import GUESSED, UNMEASURED, ImuSample, Stretch
-from ..measurement import SECOND, Array, Decoder, Message, format_stamp, frozen, stamp_of
+from ..inertial import GUESSED, UNMEASURED, Stretch
+from ..measurement import SECOND, Array, Decoder, ImuSample, Message, format_stamp, frozen, stamp_of
 from ..robust.kernels import noise_of
 
 REST = 0.05  # m/s: how still a robot stands that stands still

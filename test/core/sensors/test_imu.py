@@ -11,8 +11,8 @@ from slam_backend.core.config import ImuSource, config_from
 from slam_backend.core.errors import BadConfig
 from slam_backend.core.geometry import matrix_of
 from slam_backend.core.graph import EARTH, Decision
-from slam_backend.core.inertial import ImuSample, Inertial, State
-from slam_backend.core.measurement import SECOND, format_stamp, frozen
+from slam_backend.core.inertial import Inertial, State
+from slam_backend.core.measurement import SECOND, ImuSample, format_stamp, frozen
 from slam_backend.core.robust.chi2 import chi2_quantile
 from slam_backend.core.sensors.gnss import Fix, geodetic
 from slam_backend.core.sensors.imu import bias_key, velocity_key
