@@ -16,16 +16,15 @@ import gtsam
 import numpy as np
 
 from bench.park import parameters as solver_parameters
-from bench.stereo import Recorded
 from bench.table import Row
 from slam_backend.core.backend import Backend
 from slam_backend.core.config import Config
-from slam_backend.core.graph import Decision, Delta, Factor, total
+from slam_backend.core.graph import Decision, Delta, Estimate, Factor, total
 from slam_backend.core.inertial import imu_of, parameters
 from slam_backend.core.measurement import SECOND, Array, ImuSample, Measurement, StaticTransform
 from slam_backend.core.mounts import Mounts
 from slam_backend.core.sensors.pixels import PixelFrame
-from slam_backend.core.solvers.isam2 import JOINING
+from slam_backend.core.solvers.isam2 import JOINING, Isam2
 from slam_backend.core.space import SPACES
 from slam_backend.core.variables import estimate_in
 from slam_backend.io.configfile import configured, load_config
@@ -84,6 +83,18 @@ class Records(NamedTuple):
 class Stream:
     config: Config
     items: Sequence[Measurement]
+
+
+class Recorded(Isam2):
+    """Keeps the changes that it was given."""
+
+    def __init__(self, config: Config) -> None:
+        super().__init__(config, SPACES[config.space])
+        self.deltas: list[Delta] = []
+
+    def update(self, delta: Delta) -> Estimate:
+        self.deltas.append(delta)
+        return super().update(delta)
 
 
 def rows(names: Sequence[str] = (*DRIVES, *SETS)) -> list[Row]:

@@ -7,14 +7,10 @@ from time import process_time
 import gtsam
 import numpy as np
 
-from bench.park import parameters
 from bench.table import Row
 from slam_backend.core.backend import Backend
-from slam_backend.core.config import Config
-from slam_backend.core.graph import Decision, Delta, Estimate
+from slam_backend.core.graph import Decision
 from slam_backend.core.solvers.batch import solve
-from slam_backend.core.solvers.isam2 import Isam2
-from slam_backend.core.space import SPACES
 from slam_backend.io.configfile import configured, load_config
 from slam_backend.io.inputs import open_inputs
 from slam_backend.io.replay import replay, settled_stream
@@ -24,18 +20,6 @@ CONFIG = Path(__file__).parents[1] / "config/kitti_stereo.yaml"
 OPTIMUM = 7399.0425  # of all sightings, from gtsam by itself, the first camera fixed
 ALL = ("features.probability=1", "features.share=10")  # no sighting is doubted, no point too far
 TURNS = 3
-
-
-class Recorded(Isam2):
-    """Keeps the changes that it was given."""
-
-    def __init__(self, config: Config) -> None:
-        super().__init__(config, SPACES[config.space])
-        self.deltas: list[Delta] = []
-
-    def update(self, delta: Delta) -> Estimate:
-        self.deltas.append(delta)
-        return super().update(delta)
 
 
 def stereo() -> list[Row]:
@@ -76,10 +60,9 @@ def _batch(bag: Path) -> list[Row]:
 
 
 def _online(bag: Path) -> list[Row]:
-    """With the defaults; a bare loop gives the same changes to an ISAM2, and asks where the robot is."""
+    """With the defaults; what it costs beside a bare loop is in bench/sensors.py."""
     config = load_config(CONFIG)
-    solver = Recorded(config)
-    backend, frames = Backend(config, solver), []
+    backend, frames = Backend(config), []
     with open_inputs([bag]) as inputs:
         items = [
             item for item in settled_stream(inputs.stream(config), config) if not isinstance(item, Decision)
@@ -88,32 +71,5 @@ def _online(bag: Path) -> list[Row]:
         before = process_time()
         if backend.add(item):
             frames.append(process_time() - before)
-    bare = _bare(solver.deltas)
     p99 = float(np.percentile(frames, 99))
-    ratio = sum(frames) / sum(bare)
-    return [
-        Row("KITTI stereo, online: a frame, p99", f"{p99:.3f} s", f"{np.percentile(bare, 99):.3f} s bare iSAM2", p99, "<= 0.5"),
-        Row("the same: all frames", f"{sum(frames):.1f} s", f"{sum(bare):.1f} s bare iSAM2", ratio, "<= 1.3"),
-    ]  # fmt: skip
-
-
-def _bare(deltas: list[Delta]) -> list[float]:
-    """CPU seconds of each change in an ISAM2 of the same settings; factors are copied."""
-    isam, slots, seconds = gtsam.ISAM2(parameters()), {}, []
-    for delta in deltas:
-        before = process_time()
-        graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
-        for n, factor in enumerate(delta.add, isam.getFactorsUnsafe().size()):
-            graph.add(factor.factor.clone())
-            slots[factor.id] = n
-        for key, value in delta.values.items():
-            values.insert(key, value)
-        update = gtsam.ISAM2UpdateParams()
-        update.removeFactorIndices = [slots[id_] for id_ in delta.remove]
-        update.force_relinearize = any(factor.kind == "pixel" for factor in delta.add)
-        isam.update(graph, values, update)
-        isam.calculateEstimatePose3(
-            max(key for factor in delta.add for key in factor.keys if key >> 56 == ord("x"))
-        )
-        seconds.append(process_time() - before)
-    return seconds
+    return [Row("KITTI stereo, online: a frame, p99", f"{p99:.3f} s", "-", p99, "<= 0.5")]
